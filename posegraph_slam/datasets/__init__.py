@@ -1,0 +1,1 @@
+"""Readers from file formats to `RobotLog`, and the registry that finds them."""

@@ -1,0 +1,1 @@
+"""A simulated robot in an indoor world, with its truth."""

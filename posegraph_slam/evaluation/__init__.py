@@ -1,0 +1,1 @@
+"""Errors against truth, relations, map quality, and tables of them."""

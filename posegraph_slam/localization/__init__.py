@@ -1,0 +1,1 @@
+"""Particle filters: localisation in a known map and SLAM."""

@@ -1,0 +1,1 @@
+"""Proposing loop closures and verifying them."""

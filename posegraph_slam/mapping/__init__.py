@@ -1,0 +1,1 @@
+"""Occupancy, floor and texture maps rebuilt from a trajectory, and their files."""

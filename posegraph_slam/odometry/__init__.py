@@ -1,0 +1,1 @@
+"""Motion models, alignment of streams in time, and scan-matching odometry."""

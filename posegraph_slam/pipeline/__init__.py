@@ -1,0 +1,1 @@
+"""Typed configuration, the stages in order, and the run directory."""

@@ -1,0 +1,1 @@
+"""Nodes, constraints, noise and the solving of pose graphs; the only room that imports gtsam."""

@@ -1,0 +1,1 @@
+"""Registration of point sets and scans: one result type, several matchers."""

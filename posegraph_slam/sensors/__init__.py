@@ -1,0 +1,17 @@
+"""What a robot records and how it is calibrated."""
+
+from posegraph_slam.sensors.imu import STANDARD_GRAVITY, Imu
+from posegraph_slam.sensors.laser import LaserScans
+from posegraph_slam.sensors.rgbd import DisparityCalibration, RgbdFrames
+from posegraph_slam.sensors.robot_log import RobotLog
+from posegraph_slam.sensors.wheels import WheelEncoders
+
+__all__ = [
+    "STANDARD_GRAVITY",
+    "DisparityCalibration",
+    "Imu",
+    "LaserScans",
+    "RgbdFrames",
+    "RobotLog",
+    "WheelEncoders",
+]

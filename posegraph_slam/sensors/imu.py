@@ -1,0 +1,35 @@
+"""Inertial measurement unit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from posegraph_slam.arrays import FloatArray, read_only
+from posegraph_slam.errors import InputError
+
+STANDARD_GRAVITY = 9.80665
+"""m/s^2 in one g."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Imu:
+    """`stamps_s` (N,), `angular_velocity` (N, 3) rad/s and `linear_acceleration` (N, 3) m/s^2 in the imu frame."""
+
+    stamps_s: FloatArray
+    angular_velocity: FloatArray
+    linear_acceleration: FloatArray
+    T_base_imu: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("stamps_s", "angular_velocity", "linear_acceleration", "T_base_imu"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        expected = (len(self.stamps_s), 3)
+        if self.angular_velocity.shape != expected or self.linear_acceleration.shape != expected:
+            raise InputError(
+                "imu",
+                f"angular velocity {self.angular_velocity.shape} and linear acceleration "
+                f"{self.linear_acceleration.shape} do not fit {expected[0]} stamps",
+            )
+
+    def __len__(self) -> int:
+        return int(self.stamps_s.shape[0])
