@@ -1,0 +1,247 @@
+"""Layers of TOML files and `--set` overrides merged into any `Settings` model, and models written back as TOML.
+
+Every value remembers the layer that it came from, so that an error names the file, the key and what is allowed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from posegraph_slam.errors import ConfigurationError
+from posegraph_slam.settings import Settings
+
+Model = TypeVar("Model", bound=Settings)
+
+UNSET = "none"
+"""How a file says that an optional key has no value, which TOML has no word for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layer:
+    """Nested `values` and the file or option that they came from."""
+
+    source: str
+    values: Mapping[str, Any]
+
+
+@dataclass(slots=True)
+class _Merged:
+    """Values of all layers so far, and the source of each dotted key."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    sources: dict[str, str] = field(default_factory=dict)
+
+
+def read_layer(path: Path) -> Layer:
+    """Read one TOML file; raise ConfigurationError where it is missing or is not TOML."""
+    try:
+        with path.open("rb") as file:
+            return Layer(source=str(path), values=tomllib.load(file))
+    except OSError as error:
+        raise ConfigurationError(path, f"cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(path, f"is not valid TOML: {error}") from error
+
+
+def parse_override(text: str) -> Layer:
+    """Turn `a.b=value` into a layer; the value is read as TOML and, failing that, taken as a string."""
+    key, equals, value = text.partition("=")
+    parts = [part.strip() for part in key.split(".")]
+    if not equals or not all(parts):
+        raise ConfigurationError(f"--set {text}", "is not of the form section.key=value")
+    values: Any = _parse_value(value.strip())
+    for part in reversed(parts):
+        values = {part: values}
+    return Layer(source="--set", values=values)
+
+
+def _parse_value(text: str) -> Any:
+    try:
+        parsed = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return parsed["value"] if set(parsed) == {"value"} else text
+
+
+def build_settings(model: type[Model], layers: Sequence[Layer]) -> Model:
+    """Merge `layers`, later ones over earlier ones, and validate the result.
+
+    Raises ConfigurationError naming the layer, the dotted key, what is allowed there, and for an unknown key the
+    nearest known one. Types are strict: a string is not taken for a number nor a number for true.
+    """
+    merged = _Merged()
+    for layer in layers:
+        _merge(model, model, layer, layer.values, merged.values, "", merged.sources)
+    try:
+        return model.model_validate_json(json.dumps(merged.values, default=str), strict=True)
+    except ValidationError as error:
+        raise _explain(model, error, merged.sources) from error
+
+
+def _merge(
+    root: type[Settings],
+    model: type[Settings],
+    layer: Layer,
+    values: Mapping[str, Any],
+    into: dict[str, Any],
+    prefix: str,
+    sources: dict[str, str],
+) -> None:
+    for key, value in values.items():
+        dotted = f"{prefix}{key}"
+        if key not in model.model_fields:
+            raise ConfigurationError(layer.source, f"unknown key '{dotted}'", _suggestion(root, dotted))
+        section = _section(model.model_fields[key])
+        if section is None:
+            into[key] = None if value == UNSET and _is_optional(model.model_fields[key]) else value
+            sources[dotted] = layer.source
+        elif isinstance(value, Mapping):
+            _merge(root, section, layer, value, into.setdefault(key, {}), f"{dotted}.", sources)
+        else:
+            known = ", ".join(f"{dotted}.{name}" for name in section.model_fields)
+            raise ConfigurationError(layer.source, f"'{dotted}' is a section, not a value", f"its keys are {known}")
+
+
+def _suggestion(root: type[Settings], dotted: str) -> str:
+    known = [name for name, _, _ in walk_fields(root)] + [name for name, _ in walk_sections(root)]
+    near = difflib.get_close_matches(dotted, known, n=1, cutoff=0.7)
+    last = dotted.rsplit(".", 1)[-1]
+    near = near or [name for name in known if name.rsplit(".", 1)[-1] == last]
+    near = near or difflib.get_close_matches(dotted, known, n=1, cutoff=0.5)
+    return f"did you mean '{near[0]}'?" if near else "`psg config show` lists every key"
+
+
+def _explain(model: type[Settings], error: ValidationError, sources: Mapping[str, str]) -> ConfigurationError:
+    problems = error.errors()
+    first = problems[0]
+    names = [str(part) for part in first["loc"] if isinstance(part, str)]
+    fields = {name: info for name, info, _ in walk_fields(model)}
+    dotted = next((".".join(names[:n]) for n in range(len(names), 0, -1) if ".".join(names[:n]) in fields), "")
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    if not dotted:  # a rule that spans several keys
+        section = ".".join(names)
+        touched = sorted({source for key, source in sources.items() if key.startswith(section)})
+        where = ", ".join(touched) or "configuration"
+        return ConfigurationError(where, f"{section or 'configuration'}: {_sentence(first['msg'])}{more}")
+    given = json.dumps(first["input"], default=str)
+    return ConfigurationError(
+        sources.get(dotted, "configuration"),
+        f"'{dotted}' = {given} is not allowed",
+        f"it must be {allowed(fields[dotted])}{more}",
+    )
+
+
+def _sentence(message: str) -> str:
+    return message.removeprefix("Value error, ")
+
+
+def walk_fields(model: type[Settings], prefix: str = "") -> Iterator[tuple[str, FieldInfo, str]]:
+    """Yield dotted name, field and section of every value of `model`, sections inside sections included."""
+    for name, info in model.model_fields.items():
+        section = _section(info)
+        if section is None:
+            yield f"{prefix}{name}", info, prefix.rstrip(".")
+        else:
+            yield from walk_fields(section, f"{prefix}{name}.")
+
+
+def walk_sections(model: type[Settings], prefix: str = "") -> Iterator[tuple[str, type[Settings]]]:
+    """Yield dotted name and model of every section of `model`, in order, outer ones first."""
+    for name, info in model.model_fields.items():
+        section = _section(info)
+        if section is not None:
+            yield f"{prefix}{name}", section
+            yield from walk_sections(section, f"{prefix}{name}.")
+
+
+def _section(info: FieldInfo) -> type[Settings] | None:
+    annotation = info.annotation
+    return annotation if isinstance(annotation, type) and issubclass(annotation, Settings) else None
+
+
+def _is_optional(info: FieldInfo) -> bool:
+    return type(None) in typing.get_args(info.annotation)
+
+
+def allowed(info: FieldInfo) -> str:
+    """Say in words which values a field takes: its type or choices, and its range."""
+    bounds = []
+    for attribute, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="), ("multiple_of", "a multiple of")):
+        bounds += [f"{sign} {getattr(rule, attribute):g}" for rule in info.metadata if hasattr(rule, attribute)]
+    return _type_words(info.annotation) + (" " + " and ".join(bounds) if bounds else "")
+
+
+def _type_words(annotation: Any) -> str:
+    arguments = typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    if origin is typing.Annotated:
+        return _type_words(arguments[0])
+    if origin is typing.Literal:
+        return "one of " + ", ".join(json.dumps(choice) for choice in arguments)
+    if origin in (typing.Union, types.UnionType):
+        named = [_type_words(argument) for argument in arguments if argument is not type(None)]
+        return " or ".join([*named, json.dumps(UNSET)] if type(None) in arguments else named)
+    if origin in (tuple, list):
+        counted = "" if Ellipsis in arguments or origin is list else f"{len(arguments)} "
+        return f"a list of {counted}values, each {_type_words(arguments[0])}"
+    if isinstance(annotation, type) and issubclass(annotation, Enum):
+        return "one of " + ", ".join(json.dumps(member.value) for member in annotation)
+    words = {bool: "true or false", int: "an integer", float: "a number", str: "a string", Path: "a path"}
+    return words.get(annotation, f"a {getattr(annotation, '__name__', annotation)}")
+
+
+def to_toml(settings: Settings) -> str:
+    """Write every key of `settings` as TOML, each under a comment that describes it and names its range."""
+    lines: list[str] = []
+    _write_section(settings, "", lines)
+    return "\n".join(lines).strip() + "\n"
+
+
+def _write_section(settings: Settings, name: str, lines: list[str]) -> None:
+    fields = type(settings).model_fields
+    values = {key: info for key, info in fields.items() if _section(info) is None}
+    title = _comment((type(settings).__doc__ or "").strip().split("\n")[0])
+    if values or not fields:
+        lines += ["", *title, f"[{name}]"] if name else [*title, ""]
+    for key, info in values.items():
+        description = (info.description or "").strip().split("\n\n")[0].replace("\n", " ")
+        lines += [*_comment(f"{description} [{allowed(info)}]"), f"{key} = {_toml(getattr(settings, key))}"]
+    for key, info in fields.items():
+        if _section(info) is not None:
+            _write_section(getattr(settings, key), f"{name}.{key}".lstrip("."), lines)
+
+
+def _comment(text: str, width: int = 110) -> list[str]:
+    lines, line = [], "#"
+    for word in text.split():
+        if len(line) + 1 + len(word) > width:
+            lines.append(line)
+            line = "#"
+        line += f" {word}"
+    return [*lines, line] if line != "#" else lines
+
+
+def _toml(value: Any) -> str:
+    if value is None:
+        return json.dumps(UNSET)
+    if isinstance(value, Enum):
+        return _toml(value.value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    if isinstance(value, float):
+        return repr(float(value))
+    if isinstance(value, bool | int):
+        return json.dumps(value)
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
