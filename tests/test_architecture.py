@@ -21,7 +21,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
     ("cli",),
 )
 ROW_OF = {room: row for row, rooms in enumerate(ROWS, start=1) for room in rooms}
-SHARED = {"errors", "arrays", "settings", "jit", "execution"}
+SHARED = {"errors", "arrays", "settings", "jit", "execution", "files"}
 """Row 0: modules that every room may import and that import no room."""
 
 HOMES = {

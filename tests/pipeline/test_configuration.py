@@ -218,7 +218,7 @@ def test_presets_by_name_and_files_by_path(tmp_path: Path) -> None:
     assert load_configuration([path]).seed == 5
     assert load_configuration([path], seed=6).seed == 6
     assert load_configuration(["default", path], ["seed=8"]).seed == 8
-    with pytest.raises(ConfigurationError, match="neither a file nor a preset; the presets are .*default"):
+    with pytest.raises(ConfigurationError, match=r"neither a file nor a preset; the presets are .*default"):
         load_configuration(["no_such_preset"])
     with pytest.raises(ConfigurationError, match="--seed: 'seed' = -1 is not allowed"):
         load_configuration(seed=-1)
