@@ -47,7 +47,7 @@ class OdometrySettings(Settings):
     wheels_imu_noise: StepNoise = StepNoise()
     wheels_noise: StepNoise = StepNoise(rotation_per_sqrt_rad=0.15, rotation_per_sqrt_m=0.03)
     logged_noise: StepNoise = StepNoise(
-        translation_per_sqrt_m=0.05, translation_per_sqrt_rad=0.02, rotation_per_sqrt_rad=0.1, rotation_per_sqrt_m=0.03
+        translation_per_sqrt_m=0.05, translation_per_sqrt_rad=0.02, rotation_per_sqrt_rad=0.15, rotation_per_sqrt_m=0.03
     )
     leap_rad: float = Field(default=0.8, gt=0, description="a logged step that turns more is not believed, rad")
     leap_m: float = Field(default=1.5, gt=0, description="a logged step that is longer is not believed, m")
