@@ -1,0 +1,92 @@
+"""What all figures share: page, palette, scale bar, and files whose bytes depend on the content alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.files import replacing
+
+# Okabe and Ito 2008: told apart with every common kind of colour vision
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILLION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
+
+LONG_SIDE_IN = 7.5
+"""Longer side of the drawing area: with legend and labels it fits the width of a page."""
+SHORT_SIDE_IN = 2.5
+DPI = 200
+
+
+@contextmanager
+def page(path: Path, bounds_m: tuple[float, float, float, float], *, title: str = "") -> Iterator[Axes]:
+    """Yield axes that show left, right, bottom, top `bounds_m` at equal scale; then write them to the PNG `path`.
+
+    Adds metre labels, a scale bar and, below the axes, a legend of what was labelled.
+    """
+    left, right, bottom, top = bounds_m
+    width, height = right - left, top - bottom
+    scale = LONG_SIDE_IN / max(width, height)
+    size = max(width * scale, SHORT_SIDE_IN) + 0.8, max(height * scale, SHORT_SIDE_IN) + 1.2
+    with matplotlib.style.context("default"):
+        figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        axes.set_aspect("equal")
+        axes.set_xlim(left, right)
+        axes.set_ylim(bottom, top)
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("y [m]")
+        axes.set_title(title)
+        yield axes
+        add_scale_bar(axes)
+        handles, labels = axes.get_legend_handles_labels()
+        if handles:
+            columns = min(len(handles), max(2, int(size[0] / 1.9)))
+            figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png", bbox_inches="tight", metadata={"Software": None})
+
+
+def add_scale_bar(axes: Axes) -> None:
+    """Draw a bar of a round length, about a fifth of the width, in the lower right corner."""
+    left, right = axes.get_xlim()
+    bottom, top = axes.get_ylim()
+    length = round_length((right - left) / 5)
+    x1, y = right - 0.04 * (right - left), bottom + 0.04 * (top - bottom)
+    axes.add_line(Line2D([x1 - length, x1], [y, y], color="white", linewidth=7, alpha=0.8, zorder=9))
+    bar = Line2D([x1 - length, x1], [y, y], color=BLACK, linewidth=3, solid_capstyle="butt", zorder=10)
+    axes.add_line(bar)
+    axes.annotate(
+        f"{length:g} m",
+        (x1 - length / 2, y),
+        xytext=(0, 5),
+        textcoords="offset points",
+        ha="center",
+        fontsize=9,
+        zorder=10,
+        bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1},
+    )
+
+
+def round_length(length_m: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that is not above `length_m`."""
+    power = 10.0 ** math.floor(math.log10(length_m))
+    return next(step * power for step in (5.0, 2.0, 1.0) if step * power <= length_m * (1 + 1e-9))
+
+
+def bounds_around(points_m: FloatArray, *, margin: float = 0.05) -> tuple[float, float, float, float]:
+    """Return left, right, bottom and top around points (n, 2), with a margin in parts of the larger side."""
+    finite = points_m[np.isfinite(points_m).all(axis=1)]
+    low, high = (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(2), np.zeros(2))
+    space = margin * max(float((high - low).max()), 1.0)
+    return float(low[0] - space), float(high[0] + space), float(low[1] - space), float(high[1] + space)

@@ -1,0 +1,155 @@
+"""Figures: what they show where, and bytes that depend on the content alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
+from posegraph_slam.mapping.grid import GridGeometry
+from posegraph_slam.mapping.occupancy import OccupancyGrid
+from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
+from posegraph_slam.report.canvas import BLACK, BLUE, GREEN, ORANGE, SKY, bounds_around, round_length
+from posegraph_slam.report.figures import align_truth, draw_map, draw_texture, draw_trajectories, loop_segments
+from posegraph_slam.report.view import MAXIMUM_PIXELS, View
+
+
+def trajectory(xyt: np.ndarray) -> Trajectory:
+    return Trajectory(stamps_s=np.arange(len(xyt)) * 0.1, poses=pose_from_xyt(xyt), parent="map", child="base")
+
+
+@pytest.fixture(scope="module")
+def path_xyt() -> np.ndarray:
+    t = np.linspace(0, 5, 200)
+    return np.stack([3 * np.cos(t), 2 * np.sin(t), t], axis=1)
+
+
+@pytest.fixture(scope="module")
+def grid() -> OccupancyGrid:
+    geometry = GridGeometry.square(20.0, resolution_m=0.1)
+    observed, log_odds = np.zeros(geometry.shape, bool), np.zeros(geometry.shape)
+    observed[50:150, 50:150] = True
+    log_odds[50:150, 50:150] = -5.0
+    log_odds[50:52, 50:150] = 5.0
+    return OccupancyGrid(geometry=geometry, log_odds=log_odds, observed=observed)
+
+
+def share(path: Path, colour: str, tolerance: int = 12) -> float:
+    """Part of the pixels that have about this colour."""
+    pixels = (matplotlib.image.imread(path)[..., :3] * 255).round().astype(int)
+    wanted = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
+    return float((np.abs(pixels - wanted).max(axis=-1) <= tolerance).mean())
+
+
+def test_trajectories_of_all_stages_are_seen(tmp_path: Path, path_xyt: np.ndarray) -> None:
+    drift = path_xyt + np.linspace(0, 1, 200)[:, None] * [1.0, -0.5, 0.0]
+    stages = {"odometry": trajectory(drift), "scan matching": trajectory(drift * [0.9, 0.9, 1])}
+    both = tmp_path / "both.png"
+    draw_trajectories({**stages, "optimised": trajectory(path_xyt)}, both, truth=trajectory(path_xyt))
+    assert all(share(both, colour) > 1e-3 for colour in (ORANGE, SKY, BLUE))
+    one = tmp_path / "one.png"
+    draw_trajectories({"optimised": trajectory(path_xyt)}, one)
+    assert share(one, ORANGE) == 0.0
+    assert {item.name for item in tmp_path.iterdir()} == {"both.png", "one.png"}
+
+
+def test_same_content_gives_the_same_bytes(tmp_path: Path, path_xyt: np.ndarray, grid: OccupancyGrid) -> None:
+    for name in ("a.png", "b.png"):
+        draw_map(grid, tmp_path / name, trajectory=trajectory(path_xyt))
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_map_shows_walls_path_and_loops(tmp_path: Path, path_xyt: np.ndarray, grid: OccupancyGrid) -> None:
+    segments = np.array([[[-3.0, -3.0], [3.0, 3.0]]])
+    plain, full = tmp_path / "plain.png", tmp_path / "full.png"
+    draw_map(grid, plain)
+    assert share(plain, BLUE) == share(plain, GREEN) == 0.0
+    assert share(plain, BLACK) > 0.005
+    draw_map(
+        grid,
+        full,
+        trajectory=trajectory(path_xyt),
+        loops={ConstraintKind.PROXIMITY: segments, ConstraintKind.FIXED_INTERVAL: np.zeros((0, 2, 2))},
+        rejected=segments[:, ::-1] * [1, -1],
+    )
+    assert share(full, BLUE) > 1e-3
+    assert share(full, GREEN) > 5e-4
+    assert share(full, SKY) == 0.0
+
+
+def test_texture_shows_colours_and_walls(tmp_path: Path, grid: OccupancyGrid, path_xyt: np.ndarray) -> None:
+    colours = np.zeros((*grid.geometry.shape, 3), np.uint8)
+    colours[..., 0] = 200
+    covered = grid.observed & ~grid.occupied
+    file = tmp_path / "texture.png"
+    draw_texture(grid.geometry, colours, covered, file, occupied=grid.occupied, trajectory=trajectory(path_xyt))
+    assert share(file, "#c80000") > 0.3
+    assert share(file, "#3c3c3c") > 0.002
+    draw_texture(grid.geometry, colours, np.zeros_like(covered), tmp_path / "nothing.png")
+    assert share(tmp_path / "nothing.png", "#c80000") == 0.0
+
+
+@given(x=st.floats(-50, 50), y=st.floats(-50, 50), angle=st.floats(-3, 3))
+def test_truth_is_laid_over_the_estimate(x: float, y: float, angle: float) -> None:
+    t = np.linspace(0, 5, 60)
+    estimate = trajectory(np.stack([3 * np.cos(t), np.sin(2 * t), t], axis=1))
+    moved = pose_from_xyt(np.array([x, y, angle])) @ estimate.poses
+    longer = np.concatenate([moved, moved[-5:] @ SE2.exp(np.array([0.1, 0, 0]))])
+    truth = Trajectory(stamps_s=np.arange(len(longer)) * 0.1, poses=longer, parent="ref", child="base")
+    np.testing.assert_allclose(align_truth(truth, estimate)[:60], estimate.positions, atol=1e-9)
+
+
+def test_truth_of_another_time_is_left_as_it_is() -> None:
+    estimate = trajectory(np.zeros((5, 3)))
+    truth = trajectory(np.ones((5, 3))).restamped(np.arange(5) + 100.0)
+    np.testing.assert_array_equal(align_truth(truth, estimate), np.ones((5, 2)))
+
+
+def test_segments_by_kind() -> None:
+    positions = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    constraints = Constraints(
+        i=np.array([0, 1, 0]),
+        j=np.array([1, 2, 2]),
+        T_i_j=np.tile(np.eye(3), (3, 1, 1)),
+        information=np.tile(np.eye(3), (3, 1, 1)),
+        kind=np.array([ConstraintKind.SCAN_MATCHING, ConstraintKind.PROXIMITY, ConstraintKind.GLOBAL]),
+    )
+    segments = loop_segments(positions, constraints)
+    assert set(segments) == {ConstraintKind.PROXIMITY, ConstraintKind.GLOBAL}
+    np.testing.assert_array_equal(segments[ConstraintKind.GLOBAL], [[[0, 0], [1, 1]]])
+
+
+@given(st.floats(1e-3, 1e6))
+def test_round_length(length: float) -> None:
+    result = round_length(length)
+    assert length / 2.5 - 1e-9 <= result <= length * (1 + 1e-9)
+    assert f"{result:e}"[0] in "125"
+
+
+@given(rows=st.integers(1, 40), columns=st.integers(1, 5000))
+def test_view_keeps_every_wall_and_the_scale(rows: int, columns: int) -> None:
+    geometry = GridGeometry(origin_m=np.array([-2.0, 3.0]), resolution_m=0.5, shape=(rows, columns))
+    values = np.zeros(geometry.shape)
+    values[rows // 2, columns // 3] = 7.0
+    view = View.of(geometry, np.ones(geometry.shape, bool))
+    image = view.peaks(values)
+    assert max(image.shape) <= MAXIMUM_PIXELS
+    assert image.max() == 7.0
+    left, right, bottom, top = view.extent_m
+    assert (right - left) / image.shape[1] == pytest.approx((top - bottom) / image.shape[0])
+    row, column = np.argwhere(image == 7.0)[0]
+    pixel = view.block * 0.5
+    assert left + column * pixel <= -2 + (columns // 3 + 0.5) * 0.5 <= left + (column + 1) * pixel
+    assert bottom + row * pixel <= 3 + (rows // 2 + 0.5) * 0.5 <= bottom + (row + 1) * pixel
+    assert view.samples(values).shape == image.shape
+
+
+def test_bounds_ignore_what_is_not_finite() -> None:
+    left, right, bottom, top = bounds_around(np.array([[0.0, 0.0], [10.0, 4.0], [np.nan, 1.0]]))
+    assert (left, right, bottom, top) == pytest.approx((-0.5, 10.5, -0.5, 4.5))
+    assert bounds_around(np.zeros((0, 2)))[1] > 0
