@@ -1,1 +1,31 @@
 """A simulated robot in an indoor world, with its truth."""
+
+from posegraph_slam.datasets.simulation.files import simulate
+from posegraph_slam.datasets.simulation.run import SimulatedRun, drive, simulate_run
+from posegraph_slam.datasets.simulation.settings import (
+    DriveSettings,
+    EncoderSettings,
+    ImuSettings,
+    KinectSettings,
+    LidarSettings,
+    SimulationSettings,
+    WorldSettings,
+    demo_settings,
+    tiny_settings,
+)
+
+__all__ = [
+    "DriveSettings",
+    "EncoderSettings",
+    "ImuSettings",
+    "KinectSettings",
+    "LidarSettings",
+    "SimulatedRun",
+    "SimulationSettings",
+    "WorldSettings",
+    "demo_settings",
+    "drive",
+    "simulate",
+    "simulate_run",
+    "tiny_settings",
+]
