@@ -1,0 +1,76 @@
+"""Settings of the iterative closest point loop."""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+
+from pydantic import Field
+
+from posegraph_slam.settings import Settings
+
+
+class ResidualKind(StrEnum):
+    """What is minimised between paired points."""
+
+    POINT_TO_POINT = "point_to_point"
+    """Distance between the points; solved in closed form (Kabsch)."""
+    POINT_TO_PLANE = "point_to_plane"
+    """Distance to the target's tangent plane, in 2D its tangent line; solved by Gauss-Newton."""
+
+
+class Loss(StrEnum):
+    """Robust loss that weighs residuals down as they grow."""
+
+    NONE = "none"
+    HUBER = "huber"
+    CAUCHY = "cauchy"
+    GEMAN_MCCLURE = "geman_mcclure"
+    TUKEY = "tukey"
+
+
+class IcpSettings(Settings):
+    """How two point sets are registered; lengths in metres, angles in radians. The defaults suit indoor laser scans."""
+
+    residual: ResidualKind = ResidualKind.POINT_TO_PLANE
+    """What is minimised; point_to_plane means point-to-line in 2D."""
+    max_distance_m: float = Field(default=0.5, gt=0)
+    """Pairs farther apart are dropped."""
+    keep_fraction: float = Field(default=1.0, gt=0, le=1)
+    """Share of the nearest pairs that is kept (trimming)."""
+    max_normal_angle_rad: float | None = Field(default=None, gt=0, le=math.pi / 2)
+    """Pairs whose surface normals differ by more are dropped; none for no such test."""
+    reciprocal: bool = False
+    """Keep a pair only if its source point is also the nearest one to its target point."""
+    loss: Loss = Loss.CAUCHY
+    """Robust loss on the residuals of the remaining pairs."""
+    loss_scale_m: float | None = Field(default=None, gt=0)
+    """Standard deviation in which the loss measures a residual; none estimates it from the residuals at each step."""
+    max_iterations: int = Field(default=50, ge=1, le=10_000)
+    """Steps after which the loop stops without having converged."""
+    rotation_tolerance_rad: float = Field(default=1e-5, gt=0, lt=0.1)
+    """A step that turns less, and moves less than `translation_tolerance_m`, ends the loop."""
+    translation_tolerance_m: float = Field(default=1e-5, gt=0, lt=0.1)
+    """A step that moves less, and turns less than `rotation_tolerance_rad`, ends the loop."""
+    min_inliers: int = Field(default=10, ge=3)
+    """Fewer pairs than this end in a failure."""
+    min_inlier_fraction: float = Field(default=0.1, ge=0, le=1)
+    """A smaller share of paired source points ends in a failure."""
+    normal_neighbours: int = Field(default=10, ge=3, le=1000)
+    """Nearest points, itself among them, from which the normal at a point is estimated."""
+    degeneracy_ratio: float = Field(default=0.01, gt=0, lt=1)
+    """A direction whose share of the Hessian's largest eigenvalue is smaller counts as free."""
+    sigma_floor_m: float = Field(default=1e-3, gt=0)
+    """The residuals' standard deviation is taken as no smaller, so that perfect data are not infinitely certain."""
+    free_sigma_m: float = Field(default=10.0, gt=0)
+    """Standard deviation given to directions that the points leave free: the floor under the information."""
+
+    @classmethod
+    def point_to_point(cls) -> IcpSettings:
+        """Plain trimmed Kabsch ICP as in the course report's scan matching: unweighted, in closed form."""
+        return cls(residual=ResidualKind.POINT_TO_POINT, loss=Loss.NONE, keep_fraction=0.9, max_iterations=100)
+
+    @classmethod
+    def point_to_line(cls) -> IcpSettings:
+        """The default: Gauss-Newton on the distance to tangent lines (planes in 3D) with a Cauchy loss."""
+        return cls()

@@ -1,0 +1,124 @@
+"""Information and free directions of a registration from the Jacobian of its residuals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.geometry import SE2, SE3
+from posegraph_slam.jit import kernel
+from posegraph_slam.registration.cloud import Surface
+from posegraph_slam.registration.settings import IcpSettings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """A tangent frame in which metres and radians compare: centred on the points, turns measured on their radius.
+
+    A tangent d at the source origin and e in this frame are the same motion if d = `to_origin` e; `to_origin` (p, p).
+    """
+
+    centre: FloatArray
+    radius_m: float
+    to_origin: FloatArray
+
+
+def balanced_frame(points: FloatArray) -> Frame:
+    """Centre a tangent frame on source points (m, d); one unit of turn moves their root mean square radius by 1 m."""
+    d = points.shape[1]
+    group = SE2 if d == 2 else SE3
+    centre = points.mean(axis=0)
+    radius = max(float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)))), 1e-9)
+    shift = group.identity()
+    shift[:d, d] = centre
+    unit = np.ones(group.dof)
+    unit[rotation_part(d)] = 1.0 / radius
+    return Frame(centre=centre, radius_m=radius, to_origin=group.adjoint(shift) * unit)
+
+
+def rotation_part(dimension: int) -> slice:
+    """Where the rotation stands in a tangent: last in SE(2), first in SE(3)."""
+    return slice(2, 3) if dimension == 2 else slice(0, 3)
+
+
+def plane_jacobian(points: FloatArray, normals: FloatArray, frame: Frame) -> FloatArray:
+    """Derivative (m, p) of n . (R p + t - q) by the right update in `frame`; normals (m, d) in the source frame.
+
+    With arm a = (p - centre) / radius: dr/dv = n, dr/dw = a x n (Chen and Medioni 1992 in the source frame).
+    """
+    arm = (points - frame.centre) / frame.radius_m
+    if points.shape[1] == 2:
+        return np.column_stack([normals, arm[:, 0] * normals[:, 1] - arm[:, 1] * normals[:, 0]])
+    return np.concatenate([np.cross(arm, normals), normals], axis=1)
+
+
+def split_directions(hessian: FloatArray, ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Eigenvectors that the Hessian (p, p) holds, as columns (p, k), their values (k,), and the free ones (p, p-k).
+
+    Free are those whose eigenvalue is under `ratio` of the largest (Zhang, Kaess and Singh 2016).
+    """
+    values, vectors = np.linalg.eigh(hessian)
+    held = values > max(ratio * values[-1], np.finfo(np.float64).tiny)
+    return vectors[:, held], values[held], vectors[:, ~held]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """What a solution rests on: `jacobian` (m, p) in `frame`, robust `weights` and `residuals_m` (m,) of its pairs.
+
+    `slope` is the mean curvature of the loss over its mean weight; `target` (m,) the target rows of the pairs.
+    """
+
+    frame: Frame
+    jacobian: FloatArray
+    weights: FloatArray
+    residuals_m: FloatArray
+    slope: float
+    target: IntArray
+
+
+def information_of(evidence: Evidence, surface: Surface, settings: IcpSettings) -> tuple[FloatArray, FloatArray]:
+    """Information (p, p) at the source origin, and free unit directions (k, p), of a weighted least-squares solution.
+
+    The covariance is H^-1 M H^-1 (Huber 1967; White 1980) with M the outer products of the scores of the source
+    points, plus those of the target points, whose noise reaches every pair that leans on them. With independent
+    residuals of one variance that is sigma^2 H^-1. Free directions get `free_sigma_m`.
+    """
+    weighted = evidence.jacobian * evidence.weights[:, None]
+    basis, values, free = split_directions(evidence.jacobian.T @ weighted, settings.degeneracy_ratio)
+    scores = weighted @ basis
+    neighbours, thickness = surface.neighbours[evidence.target], surface.thickness_m[evidence.target]
+    by_pair = evidence.slope * scores * _sigma(thickness, settings)  # a score follows noise with the loss's curvature
+    by_target = spread_over_neighbours(by_pair, neighbours, len(surface.thickness_m))
+    by_source = scores * _sigma(evidence.residuals_m, settings)
+    k = neighbours.shape[1]  # the residuals hold the noise of an anchor too, 1/k of a point's
+    middle = by_source.T @ by_source * (k / (k + 1)) + by_target.T @ by_target
+    freedom = len(scores) / max(len(scores) - len(values), 1)
+    inverse = 1.0 / (evidence.slope * values)
+    covariance = freedom * inverse[:, None] * middle * inverse
+    floor = 1.0 / settings.free_sigma_m**2
+    held_values, held_vectors = np.linalg.eigh(covariance)
+    held = basis @ held_vectors
+    balanced = (held * np.maximum(1.0 / held_values, floor)) @ held.T + floor * free @ free.T
+    from_origin = np.linalg.inv(evidence.frame.to_origin)
+    information = from_origin.T @ balanced @ from_origin
+    directions = (evidence.frame.to_origin @ free).T
+    return (information + information.T) / 2, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _sigma(deviation_m: FloatArray, settings: IcpSettings) -> FloatArray:
+    """Deviations (m,) no smaller than the floor, as a column."""
+    return np.maximum(deviation_m, settings.sigma_floor_m)[:, None]
+
+
+@kernel
+def spread_over_neighbours(scores: FloatArray, neighbours: IntArray, count: int) -> FloatArray:
+    """Add each score (m, k) in equal shares to the points named by its row of `neighbours` (m, j): (count, k)."""
+    result = np.zeros((count, scores.shape[1]))
+    for row in range(neighbours.shape[0]):
+        for j in range(neighbours.shape[1]):
+            for a in range(scores.shape[1]):
+                result[neighbours[row, j], a] += scores[row, a] / neighbours.shape[1]
+    return result
