@@ -11,7 +11,7 @@ import tomllib
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,14 +34,6 @@ class Layer:
 
     source: str
     values: Mapping[str, Any]
-
-
-@dataclass(slots=True)
-class _Merged:
-    """Values of all layers so far, and the source of each dotted key."""
-
-    values: dict[str, Any] = field(default_factory=dict)
-    sources: dict[str, str] = field(default_factory=dict)
 
 
 def read_layer(path: Path) -> Layer:
@@ -75,52 +67,60 @@ def _parse_value(text: str) -> Any:
     return parsed["value"] if set(parsed) == {"value"} else text
 
 
-def build_settings(model: type[Model], layers: Sequence[Layer]) -> Model:
-    """Merge `layers`, later ones over earlier ones, and validate the result.
+def build_settings(model: type[Model], layers: Sequence[Layer], *, listing: str = "psg config show") -> Model:
+    """Merge `layers`, later ones over earlier ones and all over the defaults, and validate the result.
 
     Raises ConfigurationError naming the layer, the dotted key, what is allowed there, and for an unknown key the
-    nearest known one. Types are strict: a string is not taken for a number nor a number for true.
+    nearest known one, or else the command `listing` that prints them all. Types are strict: a string is not taken
+    for a number nor a number for true.
     """
-    merged = _Merged()
+    # all defaults are written out, since a section's own defaults may differ from those of its class
+    values, sources = model().model_dump(mode="json"), dict[str, str]()
     for layer in layers:
-        _merge(model, model, layer, layer.values, merged.values, "", merged.sources)
-    try:
-        return model.model_validate_json(json.dumps(merged.values, default=str), strict=True)
-    except ValidationError as error:
-        raise _explain(model, error, merged.sources) from error
-
-
-def _merge(
-    root: type[Settings],
-    model: type[Settings],
-    layer: Layer,
-    values: Mapping[str, Any],
-    into: dict[str, Any],
-    prefix: str,
-    sources: dict[str, str],
-) -> None:
-    for key, value in values.items():
-        dotted = f"{prefix}{key}"
-        if key not in model.model_fields:
-            raise ConfigurationError(layer.source, f"unknown key '{dotted}'", _suggestion(root, dotted))
-        section = _section(model.model_fields[key])
-        if section is None:
-            into[key] = None if value == UNSET and _is_optional(model.model_fields[key]) else value
+        for dotted, value in _flatten(model, layer.values):
+            info = _find(model, layer.source, dotted, listing)
+            *parents, last = dotted.split(".")
+            section = values
+            for parent in parents:
+                section = section[parent]
+            section[last] = None if value == UNSET and _is_optional(info) else value
             sources[dotted] = layer.source
-        elif isinstance(value, Mapping):
-            _merge(root, section, layer, value, into.setdefault(key, {}), f"{dotted}.", sources)
+    try:
+        return model.model_validate_json(json.dumps(values, default=str), strict=True)
+    except ValidationError as error:
+        raise _explain(model, error, sources) from error
+
+
+def _flatten(model: type[Settings], values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted key and value; tables are followed as deep as `model` has sections."""
+    for key, value in values.items():
+        section = _section(model.model_fields[key]) if key in model.model_fields else None
+        if section is not None and isinstance(value, Mapping):
+            yield from _flatten(section, value, f"{prefix}{key}.")
         else:
-            known = ", ".join(f"{dotted}.{name}" for name in section.model_fields)
-            raise ConfigurationError(layer.source, f"'{dotted}' is a section, not a value", f"its keys are {known}")
+            yield f"{prefix}{key}", value
 
 
-def _suggestion(root: type[Settings], dotted: str) -> str:
-    known = [name for name, _, _ in walk_fields(root)] + [name for name, _ in walk_sections(root)]
-    near = difflib.get_close_matches(dotted, known, n=1, cutoff=0.7)
+def _find(model: type[Settings], source: str, dotted: str, listing: str) -> FieldInfo:
+    """Return the field called `dotted`, or raise an error that says what is near it."""
+    fields = {name: info for name, info, _ in walk_fields(model)}
+    sections = dict(walk_sections(model))
+    if dotted in sections:
+        known = ", ".join(f"{dotted}.{name}" for name in sections[dotted].model_fields)
+        raise ConfigurationError(source, f"'{dotted}' is a section, not a value", f"its keys are {known}")
+    if dotted not in fields:
+        near = _nearest(dotted, [*fields, *sections])
+        remedy = f"did you mean '{near}'?" if near else f"`{listing}` lists every key"
+        raise ConfigurationError(source, f"unknown key '{dotted}'", remedy)
+    return fields[dotted]
+
+
+def _nearest(dotted: str, known: Sequence[str]) -> str | None:
     last = dotted.rsplit(".", 1)[-1]
-    near = near or [name for name in known if name.rsplit(".", 1)[-1] == last]
-    near = near or difflib.get_close_matches(dotted, known, n=1, cutoff=0.5)
-    return f"did you mean '{near[0]}'?" if near else "`psg config show` lists every key"
+    near = difflib.get_close_matches(dotted, known, n=1, cutoff=0.8)
+    near += [name for name in known if name.rsplit(".", 1)[-1] == last]
+    near += difflib.get_close_matches(dotted, known, n=1, cutoff=0.5)
+    return near[0] if near else None
 
 
 def _explain(model: type[Settings], error: ValidationError, sources: Mapping[str, str]) -> ConfigurationError:

@@ -82,6 +82,7 @@ class Root(Settings):
     seed: int = Field(0, ge=0)
     """The seed."""
     mapping: Section = Section()
+    coarse: Section = Section(resolution_m=0.5, name="coarse")
 
 
 def build(*overrides: str) -> Root:
@@ -112,6 +113,11 @@ def test_later_layers_win_key_by_key(tmp_path: Path) -> None:
     second.write_text("mapping.name = 'second'\n")
     root = build_settings(Root, [read_layer(first), read_layer(second), parse_override("seed=7")])
     assert (root.seed, root.mapping.resolution_m, root.mapping.name, root.mapping.inner.depth) == (7, 0.1, "second", 5)
+
+
+def test_one_key_of_a_section_leaves_its_other_defaults() -> None:
+    root = build("coarse.low=1")
+    assert (root.coarse.low, root.coarse.resolution_m, root.coarse.name) == (1, 0.5, "coarse")
 
 
 @pytest.mark.parametrize(
@@ -180,7 +186,7 @@ def test_toml_reads_back_as_the_same_settings(resolution, depth, name, size, off
     section = Section(
         resolution_m=resolution, inner=Inner(depth=depth), name=name, size_m=size, offset=offset, loss=loss
     )
-    root = Root(seed=depth, mapping=section)
+    root = Root(seed=depth, coarse=section)
     values = tomllib.loads(to_toml(root))
     again = build_settings(Root, [Layer(source="file", values=values)])
     assert again == root
