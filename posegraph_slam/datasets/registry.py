@@ -1,0 +1,123 @@
+"""The formats that can be read, and the choice of one for a path.
+
+Built-in readers are named by module and imported on first use, so that listing them costs nothing. Other packages add
+a reader through the entry-point group `posegraph_slam.readers`; each entry point names a `Reader`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from posegraph_slam.errors import InputError
+
+if TYPE_CHECKING:
+    from posegraph_slam.sensors import RobotLog
+
+ENTRY_POINT_GROUP = "posegraph_slam.readers"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reader:
+    """One format: what it is, how to recognise it cheaply, and how to read it.
+
+    `detects(path)` looks at names and first bytes only and never raises; `read(path)` returns a `RobotLog` or raises
+    `InputError` naming the file. `layout` describes for people what the path has to be.
+    """
+
+    name: str
+    description: str
+    layout: str
+    detects: Callable[[Path], bool]
+    read: Callable[[Path], RobotLog]
+
+
+def _built_in(name: str, description: str, layout: str) -> Reader:
+    """Describe the reader in `posegraph_slam.datasets.<name>`, whose module is imported at the first call."""
+    module = f"posegraph_slam.datasets.{name}"
+
+    def detects(path: Path) -> bool:
+        return bool(importlib.import_module(module).detects(path))
+
+    def read_log(path: Path) -> RobotLog:
+        log: RobotLog = importlib.import_module(module).read(path)
+        return log
+
+    return Reader(name=name, description=description, layout=layout, detects=detects, read=read_log)
+
+
+BUILT_IN = (
+    _built_in(
+        "ece276a",
+        "differential-drive robot with wheel encoders, IMU, LiDAR and Kinect (UCSD ECE276A, UPenn ESE650)",
+        "a folder with Encoders*.npz, Imu*.npz, Hokuyo*.npz and, when present, Kinect*.npz and its PNG frames",
+    ),
+    _built_in(
+        "carmen",
+        "laser log of the CARMEN robot navigation toolkit (FLASER, RLASER, ROBOTLASER1, ODOM, PARAM)",
+        "a text file .clf, .log or .txt, or one of them compressed as .gz",
+    ),
+)
+
+
+def available_readers() -> tuple[Reader, ...]:
+    """Return the built-in readers, then those of other packages by name.
+
+    A package whose entry point does not load, is no `Reader` or takes a name already in use is left out with a
+    warning: a broken add-on must not stop the reading of other formats.
+    """
+    readers = {reader.name: reader for reader in BUILT_IN}
+    for point in sorted(metadata.entry_points(group=ENTRY_POINT_GROUP), key=lambda point: (point.name, point.value)):
+        try:
+            reader = point.load()
+        except Exception as error:
+            warnings.warn(f"reader {point.value} cannot be loaded: {error}", RuntimeWarning, stacklevel=2)
+            continue
+        if not isinstance(reader, Reader):
+            warnings.warn(f"reader {point.value} is not a posegraph_slam Reader", RuntimeWarning, stacklevel=2)
+        elif reader.name in readers:
+            warnings.warn(f"reader {point.value} is ignored: '{reader.name}' exists", RuntimeWarning, stacklevel=2)
+        else:
+            readers[reader.name] = reader
+    return tuple(readers.values())
+
+
+def read(path: str | Path, *, format: str | None = None) -> RobotLog:  # noqa: A002 - the word users know
+    """Read the log at `path` with the reader called `format`, or with the first one that recognises it.
+
+    Raises `InputError` when the path does not exist, the format is unknown, no reader recognises the path, or the
+    reader finds the content unusable.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(path, "no such file or folder", "check the path")
+    if path.is_dir() and not any(path.iterdir()):
+        raise InputError(path, "the folder is empty", "give a folder or file that holds a log")
+    readers = available_readers()
+    reader = _choose(path, readers) if format is None else _named(format, readers)
+    return reader.read(path)
+
+
+def _named(name: str, readers: tuple[Reader, ...]) -> Reader:
+    """Find the reader called `name`, or say which names exist and which one is nearest."""
+    by_name = {reader.name: reader for reader in readers}
+    if name in by_name:
+        return by_name[name]
+    near = difflib.get_close_matches(name.lower(), by_name, n=1, cutoff=0.5)
+    guess = f"did you mean '{near[0]}'? " if near else ""
+    raise InputError("format", f"unknown format '{name}'", f"{guess}available: {', '.join(by_name)}")
+
+
+def _choose(path: Path, readers: tuple[Reader, ...]) -> Reader:
+    """Find the first reader that recognises `path`, or list what could have been read."""
+    for reader in readers:
+        if reader.detects(path):
+            return reader
+    formats = "; ".join(f"{reader.name}: {reader.layout}" for reader in readers)
+    raise InputError(path, "no reader recognises it", f"name the format, or give one of these: {formats}")

@@ -1,0 +1,28 @@
+"""Relations files of the SLAM benchmark of Kuemmerle et al. 2009: `t1 t2 x y z roll pitch yaw` a line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from posegraph_slam.datasets.number_text import read_table, refuse_first
+from posegraph_slam.geometry import Relations, pose_from_rotation_translation
+
+COLUMNS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
+
+
+def read_relations(path: str | Path) -> Relations:
+    """Read true poses T_1_2 (M, 4, 4) of the robot at t2 in its frame at t1; metres and radians.
+
+    The rotation is Rz(yaw) Ry(pitch) Rx(roll). Comments (#) and blank lines are skipped. Raises `InputError` naming the
+    line for a wrong number of columns or a value that is not finite.
+    """
+    path = Path(path)
+    values, numbers = read_table(path, COLUMNS)
+    refuse_first(~np.isfinite(values).all(axis=1), path, numbers, "holds a value that is not finite")
+    R = Rotation.from_euler("xyz", values[:, 5:]).as_matrix()
+    return Relations(
+        stamps_1_s=values[:, 0], stamps_2_s=values[:, 1], T_1_2=pose_from_rotation_translation(R, values[:, 2:5])
+    )
