@@ -34,6 +34,6 @@ def constraint_jacobians(graph: PoseGraph) -> tuple[FloatArray, FloatArray, Floa
     c, group = graph.constraints, graph.group
     T_ij_now = group.between(graph.poses[c.i], graph.poses[c.j])
     residuals = group.local(c.T_i_j, T_ij_now)
-    by_j: FloatArray = np.linalg.inv(group.right_jacobian(residuals))
-    by_i: FloatArray = -by_j @ group.adjoint(group.inverse(T_ij_now))
+    by_j = np.asarray(np.linalg.inv(group.right_jacobian(residuals)), dtype=np.float64)
+    by_i = np.negative(by_j @ group.adjoint(group.inverse(T_ij_now)))
     return residuals, by_i, by_j

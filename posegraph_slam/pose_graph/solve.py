@@ -1,0 +1,166 @@
+"""Solving a pose graph: checks, the optimiser, and the proof that it did its work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.execution import Progress, silent_progress
+from posegraph_slam.pose_graph.checks import check_graph
+from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
+from posegraph_slam.pose_graph.gtsam_solver import OptimizerRun, chosen_ordering, run_gtsam
+from posegraph_slam.pose_graph.residuals import chi2, chi2_of_residuals, constraint_jacobians
+from posegraph_slam.pose_graph.robust import RobustSettings, robust_costs, robust_weights
+from posegraph_slam.pose_graph.solver_settings import (
+    EliminationOrdering,
+    SolveResult,
+    SolverMethod,
+    SolverSettings,
+    StopReason,
+)
+
+OPTIMALITY_TOLERANCE = 1e-6
+"""Largest share of the cost that a move of the nodes one by one may still promise at an optimum."""
+OPTIMALITY_FLOOR = 1e-9
+"""The same in absolute terms, for graphs that fit perfectly."""
+CLAMPS = (1e2, 1e5)
+"""Caps on information eigenvalues, over the median of the edges' largest, of the starts tried after a stall."""
+
+
+def solve(
+    graph: PoseGraph, settings: SolverSettings | None = None, *, progress: Progress = silent_progress
+) -> SolveResult:
+    """Minimise the sum of rho(sqrt(chi2)) over all poses of a graph but the fixed ones; SE(2) and SE(3) alike.
+
+    The graph is checked first (`GraphError`). Loop constraints are under the robust loss of the settings; fixed nodes
+    keep their poses exactly. The result never costs more than the start. GTSAM can return its start without an
+    error (an information eigenvalue of 1e12 suffices); this is recognised by the gradient, then other orderings and a
+    start from the graph with clamped information are tried, and what remains is said in `stop_reason` and `notes`.
+    """
+    settings = SolverSettings() if settings is None else settings
+    check_graph(graph)
+    cost_initial = graph_cost(graph, settings.robust)
+    best = run_gtsam(graph, settings, progress)
+    best_cost, notes = graph_cost(graph.with_poses(best.poses), settings.robust), []
+    stuck = not _is_optimum(graph, best, settings)
+    for note, start, variant in _attempts(graph, settings) if stuck and settings.retry else ():
+        notes.append(note)
+        warm = graph if start is None else graph.with_poses(run_gtsam(start, settings, progress).poses)
+        run = run_gtsam(_cheaper(graph, warm, best.poses, settings), variant, progress)
+        cost = graph_cost(graph.with_poses(run.poses), settings.robust)
+        if cost < best_cost:
+            best, best_cost = run, cost
+        if not (stuck := not _is_optimum(graph, best, settings)):
+            break
+    return _result(graph, settings, cost_initial, best, stuck, tuple(notes))
+
+
+def constraint_costs(graph: PoseGraph, squared: FloatArray, robust: RobustSettings) -> FloatArray:
+    """Return the cost (E,) of each constraint from its chi-square: robust for loops, half of it for the others."""
+    return np.where(graph.constraints.is_loop, robust_costs(squared, robust), 0.5 * squared)
+
+
+def constraint_weights(graph: PoseGraph, squared: FloatArray, robust: RobustSettings) -> FloatArray:
+    """Return the robust weight (E,) of each constraint from its chi-square; 1 for those that close no loop."""
+    return np.where(graph.constraints.is_loop, robust_weights(squared, robust), 1.0)
+
+
+def graph_cost(graph: PoseGraph, robust: RobustSettings | None = None) -> float:
+    """Return the cost of a graph at its poses: half the sum of chi-square, with the loss on loops if given."""
+    robust = RobustSettings() if robust is None else robust
+    return float(np.sum(constraint_costs(graph, chi2(graph), robust)))
+
+
+def possible_decrease(graph: PoseGraph, robust: RobustSettings | None = None) -> float:
+    """Estimate the cost that moving each node alone would save, to first order: 1/2 sum g^T H^-1 g over its block.
+
+    It is near zero only where the gradient is, is free of units, and so tells an optimum from a stalled solver.
+    """
+    robust = RobustSettings() if robust is None else robust
+    c, n, p = graph.constraints, len(graph), graph.group.dof
+    residuals, by_i, by_j = constraint_jacobians(graph)
+    weights = constraint_weights(graph, chi2_of_residuals(residuals, c.information), robust)
+    information = c.information * weights[:, None, None]
+    gradient, hessian = np.zeros((n, p)), np.zeros((n, p, p))
+    for rows, jacobian in ((c.i, by_i), (c.j, by_j)):
+        weighted = np.swapaxes(jacobian, 1, 2) @ information
+        np.add.at(gradient, rows, (weighted @ residuals[..., None])[..., 0])
+        np.add.at(hessian, rows, weighted @ jacobian)
+    free = ~graph.fixed
+    damping = 1e-12 * np.trace(hessian[free], axis1=1, axis2=2)[:, None, None] * np.eye(p) + 1e-300 * np.eye(p)
+    steps = np.linalg.solve(hessian[free] + damping, gradient[free][..., None])[..., 0]
+    return float(0.5 * np.sum(gradient[free] * steps))
+
+
+def clamp_information(constraints: Constraints, largest: float) -> Constraints:
+    """Return the constraints with the eigenvalues of their information limited to `largest`."""
+    values, vectors = np.linalg.eigh(constraints.information)
+    clamped = (vectors * np.minimum(values, largest)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    changed = (values[:, -1] > largest)[:, None, None]
+    information = np.where(changed, 0.5 * (clamped + np.swapaxes(clamped, 1, 2)), constraints.information)
+    return Constraints(
+        i=constraints.i, j=constraints.j, T_i_j=constraints.T_i_j, information=information, kind=constraints.kind
+    )
+
+
+def _is_optimum(graph: PoseGraph, run: OptimizerRun, settings: SolverSettings) -> bool:
+    if run.stop_reason is StopReason.MAX_ITERATIONS:
+        return True
+    solved = graph.with_poses(run.poses)
+    saved = possible_decrease(solved, settings.robust)
+    return saved <= OPTIMALITY_TOLERANCE * graph_cost(solved, settings.robust) + OPTIMALITY_FLOOR
+
+
+def _attempts(graph: PoseGraph, settings: SolverSettings) -> Iterator[tuple[str, PoseGraph | None, SolverSettings]]:
+    """What to try after a stall: (what it is, graph to solve first for a start or None, settings)."""
+    damped = settings.model_copy(update={"method": SolverMethod.LEVENBERG_MARQUARDT})
+    metis, colamd = EliminationOrdering.METIS, EliminationOrdering.COLAMD
+    other = colamd if chosen_ordering(graph, settings.ordering) is metis else metis
+    yield f"stalled: tried {other} ordering", None, damped.model_copy(update={"ordering": other})
+    largest = np.linalg.eigvalsh(graph.constraints.information)[:, -1]
+    for factor in CLAMPS:
+        cap = factor * float(np.median(largest))
+        if np.any(largest > cap):
+            clamped = graph.with_constraints(clamp_information(graph.constraints, cap))
+            yield f"stalled: tried a start with information clamped at {cap:.3g}", clamped, damped
+
+
+def _cheaper(graph: PoseGraph, warm: PoseGraph, poses: FloatArray, settings: SolverSettings) -> PoseGraph:
+    """Return the graph at the cheaper of two sets of poses."""
+    warm = graph.with_poses(warm.poses)
+    best = graph.with_poses(poses)
+    return warm if graph_cost(warm, settings.robust) < graph_cost(best, settings.robust) else best
+
+
+def _result(
+    graph: PoseGraph,
+    settings: SolverSettings,
+    cost_initial: float,
+    run: OptimizerRun,
+    stuck: bool,
+    notes: tuple[str, ...],
+) -> SolveResult:
+    poses = np.where(graph.fixed[:, None, None], graph.poses, run.poses)
+    squared = chi2(graph.with_poses(poses))
+    cost = float(np.sum(constraint_costs(graph, squared, settings.robust)))
+    reason = run.stop_reason
+    if cost > cost_initial * (1 + 1e-12) or not np.isfinite(cost):
+        poses, squared, cost = graph.poses, chi2(graph), cost_initial
+    if stuck:
+        reason = StopReason.DIVERGED if reason is StopReason.DIVERGED else StopReason.STALLED
+    elif reason is not StopReason.MAX_ITERATIONS:
+        unchanged = cost_initial - cost <= settings.relative_tolerance * cost_initial + settings.absolute_tolerance
+        reason = StopReason.ALREADY_OPTIMAL if unchanged else StopReason.CONVERGED
+    return SolveResult(
+        poses=poses,
+        cost_initial=cost_initial,
+        cost=cost,
+        iterations=len(run.record.cost) - 1,
+        stop_reason=reason,
+        record=run.record,
+        chi2=squared,
+        weights=constraint_weights(graph, squared, settings.robust),
+        notes=notes,
+    )
