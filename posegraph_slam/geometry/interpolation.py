@@ -14,11 +14,11 @@ def interpolate(trajectory: Trajectory, stamps_s: FloatArray) -> Trajectory:
 
     The trajectory is taken in stamp order; of poses with equal stamps the last one counts.
     """
+    if len(trajectory) == 0:
+        raise InputError("trajectory", "has no poses to interpolate between")
     ordered = trajectory.in_stamp_order()
     last_of_equal = np.r_[np.diff(ordered.stamps_s) > 0, True]
     known = ordered.select(np.flatnonzero(last_of_equal))
-    if len(known) == 0:
-        raise InputError("trajectory", "has no poses to interpolate between")
     stamps = np.asarray(stamps_s, dtype=np.float64)
     if len(known) == 1:
         return known.select(np.zeros(len(stamps), dtype=np.int64)).restamped(stamps)
