@@ -35,10 +35,10 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	@$(PIP) --editable '.[dev]'
 	@touch $(VENV)/.installed $@
 
-demo/log/truth.tum: $(SIMULATION) | $(VENV)/.installed
+demo/log/world.json: $(SIMULATION) | $(VENV)/.installed
 	@$(BIN)/psg simulate --out demo/log --overwrite
 
-demo: $(VENV)/.installed demo/log/truth.tum
+demo: $(VENV)/.installed demo/log/world.json
 	@$(BIN)/psg optimize demo/log --out demo/run --overwrite
 
 lint: $(VENV)/.installed-dev

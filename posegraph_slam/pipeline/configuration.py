@@ -11,7 +11,10 @@ from pathlib import Path
 from pydantic import Field
 
 from posegraph_slam.errors import ConfigurationError
+from posegraph_slam.mapping.occupancy import OccupancySettings
+from posegraph_slam.odometry.settings import OdometrySettings
 from posegraph_slam.pipeline.settings_files import Layer, build_settings, parse_override, read_layer
+from posegraph_slam.pose_graph.solver_settings import SolverSettings
 from posegraph_slam.settings import Settings
 
 
@@ -22,6 +25,9 @@ class Configuration(Settings):
     """Seed of every random choice; the same log, seed and configuration give the same results."""
     workers: int = Field(0, ge=0, le=1024)
     """Threads or processes that share the work, 0 for one a core; results do not depend on it."""
+    odometry: OdometrySettings = OdometrySettings()
+    pose_graph: SolverSettings = SolverSettings()
+    mapping: OccupancySettings = OccupancySettings()
 
 
 def preset_folder() -> Path:

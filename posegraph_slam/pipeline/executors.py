@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor as FuturesExecutor
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Literal
 
@@ -69,10 +70,21 @@ class ProcessExecutor(PoolExecutor):
         super().__init__(ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")), workers)
 
 
-def make_executor(workers: int, kind: Kind = "threads") -> Executor:
+def make_executor(workers: int, kind: Kind = "threads") -> SerialExecutor | PoolExecutor:
     """Return an executor with `workers` (at least 1); one worker runs in the calling thread."""
     if workers < 1:
         raise ConfigurationError("workers", f"{workers} is not a number of workers", "it must be an integer >= 1")
     if workers == 1:
         return SerialExecutor()
     return ThreadExecutor(workers) if kind == "threads" else ProcessExecutor(workers)
+
+
+@contextmanager
+def open_executor(workers: int, kind: Kind = "threads") -> Iterator[Executor]:
+    """Yield the executor of `make_executor`, and release its workers when the block ends."""
+    executor = make_executor(workers, kind)
+    try:
+        yield executor
+    finally:
+        if isinstance(executor, PoolExecutor):
+            executor.close()

@@ -11,7 +11,13 @@ import pytest
 
 from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.execution import Executor, SerialExecutor
-from posegraph_slam.pipeline.executors import PoolExecutor, ProcessExecutor, ThreadExecutor, make_executor
+from posegraph_slam.pipeline.executors import (
+    PoolExecutor,
+    ProcessExecutor,
+    ThreadExecutor,
+    make_executor,
+    open_executor,
+)
 
 
 @pytest.fixture(params=["serial", "threads", "processes"])
@@ -58,3 +64,12 @@ def test_make_executor() -> None:
     processes.close()
     with pytest.raises(ConfigurationError, match=">= 1"):
         make_executor(0)
+
+
+def test_open_executor_releases_its_workers() -> None:
+    with open_executor(2) as pool:
+        assert pool.map(abs, [-1, 2]) == [1, 2]
+    with pytest.raises(RuntimeError, match="shutdown"):
+        pool.map(abs, [1])
+    with open_executor(1) as serial:
+        assert serial.map(abs, [-3]) == [3]

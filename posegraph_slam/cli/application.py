@@ -1,0 +1,101 @@
+"""The commands put together, and how every one of them ends: exit codes and one line for an error."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+import warnings
+from typing import Annotated, Any, TextIO
+
+import typer
+from typer.core import TyperGroup
+
+from posegraph_slam import __version__
+from posegraph_slam.cli import configuration, datasets, inspection, optimisation, simulation
+from posegraph_slam.errors import PosegraphSlamError
+
+EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+
+
+class Commands(TyperGroup):
+    """Runs a command and turns what a user can cause into one line on stderr; other exceptions are bugs and pass."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command of `ctx`; exit with 2 on a user's error and 130 on Ctrl-C."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.secho("\ninterrupted; nothing was written", fg=typer.colors.RED, err=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except BrokenPipeError:
+            raise
+        except (PosegraphSlamError, OSError) as error:
+            if ctx.params.get("debug"):
+                typer.echo(traceback.format_exc(), err=True)
+            typer.secho(f"error: {one_line(error)}", fg=typer.colors.RED, err=True)
+            raise typer.Exit(EXIT_ERROR) from None
+
+
+def one_line(error: Exception) -> str:
+    """Return the message of an error on one line, with the file first for errors of the system."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def show_version(wanted: bool) -> None:
+    """Print the version and end."""
+    if wanted:
+        typer.echo(f"psg {__version__}")
+        raise typer.Exit
+
+
+app = typer.Typer(
+    name="psg",
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback()
+def options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=show_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Turn a robot's log into an optimised trajectory and maps.
+
+    Most logs need `psg optimize LOG` alone; `psg inspect LOG` tells first what is in one.
+
+    Exit codes: 0 done, 2 wrong input or usage, 130 interrupted, 1 a bug.
+    """
+
+
+app.command("optimize", short_help="Optimise a log: trajectory, maps, comparison.")(optimisation.optimize)
+app.command("inspect", short_help="Show what is in a log, and what is suspicious.")(inspection.inspect)
+app.command("simulate", short_help="Write a simulated log with its truth.")(simulation.simulate)
+app.command("datasets", short_help="List the formats that can be read.")(datasets.datasets)
+app.add_typer(configuration.app, name="config", short_help="List presets, show the configuration.")
+
+
+def main() -> None:
+    """Run the command line."""
+    warnings.showwarning = _show_warning
+    app()
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Show a warning as one line without the place in the code."""
+    sys.stderr.write(f"warning: {' '.join(str(message).split())}\n")

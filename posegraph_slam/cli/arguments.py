@@ -1,0 +1,25 @@
+"""Options that several commands have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Log = Annotated[
+    Path, typer.Argument(metavar="LOG", help="File or folder of the log; `psg datasets` lists the formats.")
+]
+Format = Annotated[str | None, typer.Option("--format", help="Reader to use instead of the one that recognises LOG.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set one configuration key, as section.key=value; repeatable."),
+]
+Config = Annotated[
+    list[str] | None,
+    typer.Option("--config", metavar="FILE|PRESET", help="TOML file or preset; repeatable, later ones win."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else on stdout.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print remarks and the time of each stage too.")]

@@ -1,0 +1,77 @@
+"""`psg optimize`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Set, Verbose
+from posegraph_slam.cli.console import ProgressBars, print_json, print_table, print_warning
+
+if TYPE_CHECKING:
+    from posegraph_slam.pipeline.run import RunSummary
+
+
+def optimize(
+    log: Log,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run directory; default: runs/NAME OF LOG.")] = None,
+    config: Config = None,
+    settings: Set = None,
+    truth: Annotated[Path | None, typer.Option("--truth", help="TUM file of true poses to compare with.")] = None,
+    log_format: Format = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    as_json: Json = False,
+) -> None:
+    """Turn a log into an optimised trajectory and maps, in a run directory of its own."""
+    from posegraph_slam.pipeline.configuration import load_configuration
+    from posegraph_slam.pipeline.run import run
+    from posegraph_slam.report.run_figures import draw_figures
+
+    configuration = load_configuration(config or [], settings or [], seed=seed, workers=workers)
+    with ProgressBars(enabled=not quiet) as progress:
+        summary = run(
+            log,
+            configuration,
+            out=out or default_out(log),
+            overwrite=overwrite,
+            log_format=log_format,
+            truth=truth,
+            draw=draw_figures,
+            progress=progress,
+        )
+    if as_json:
+        print_json({"folder": str(summary.folder), "metrics": summary.metrics, "run": summary.record})
+    elif not quiet:
+        print_summary(summary, verbose=verbose)
+
+
+def default_out(log: Path) -> Path:
+    """Return `runs/<name of the log>`, for a log like `20` inside `ece276a` as `runs/20`."""
+    resolved = log.resolve()
+    name = resolved.name if resolved.is_dir() else resolved.name.removesuffix(".gz").rsplit(".", 1)[0]
+    return Path("runs") / (name or "log")
+
+
+def print_summary(summary: RunSummary, *, verbose: bool) -> None:
+    """Print the comparison of the stages, then where the results lie; remarks go to stderr."""
+    for remark in summary.remarks:
+        print_warning(remark)
+    print_table(summary.table.as_text_rows())
+    if verbose:
+        seconds = summary.record["stages_s"]
+        width = max(map(len, seconds), default=0)
+        typer.echo("")
+        for name, value in seconds.items():
+            typer.echo(f"{name:<{width}}  {value:8.2f} s")
+        typer.echo(
+            f"compiling {summary.record['jit_compile_s']:.1f} s, peak {summary.record['peak_memory_mib']:.0f} MiB"
+        )
+    typer.echo(f"\nresults:  {summary.folder}")
+    for picture in sorted(summary.folder.glob("figures/*.png")):
+        typer.echo(f"picture:  {picture}")

@@ -1,0 +1,36 @@
+"""The pictures of one run, drawn into its directory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from posegraph_slam.pipeline.optimize import OptimizationResult
+from posegraph_slam.pipeline.run_directory import RunDirectory
+from posegraph_slam.report.figures import draw_map, draw_texture, draw_trajectories, loop_segments
+
+
+def draw_figures(result: OptimizationResult, directory: RunDirectory) -> None:
+    """Draw the trajectories of the stages, the map with its loops, the rejected ones too, and the texture if any.
+
+    Files: figures/trajectories.png, figures/map.png, figures/map_rejected.png, figures/texture.png.
+    """
+    draw_trajectories(result.stages, directory.path("figures/trajectories.png"), truth=result.truth)
+    positions = result.graph.poses[:, :-1, -1]
+    loops = loop_segments(positions, result.graph.constraints)
+    draw_map(result.occupancy, directory.path("figures/map.png"), trajectory=result.trajectory, loops=loops)
+    if len(result.rejected_pairs):
+        draw_map(
+            result.occupancy,
+            directory.path("figures/map_rejected.png"),
+            trajectory=result.trajectory,
+            loops=loops,
+            rejected=np.asarray(positions[result.rejected_pairs][..., :2]),
+        )
+    if result.texture is not None:
+        draw_texture(
+            result.texture.geometry,
+            result.texture.colours,
+            result.texture.covered,
+            directory.path("figures/texture.png"),
+            trajectory=result.trajectory,
+        )
