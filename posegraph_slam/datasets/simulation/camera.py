@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from posegraph_slam.arrays import ByteArray, FloatArray, IntArray, read_only
 from posegraph_slam.datasets.simulation import robot
@@ -86,12 +87,31 @@ def _distance(dx: float, dy: float, hit: int, segments: FloatArray, circles: Flo
         slope = dx * (by - ay) - dy * (bx - ax)
         along = (ax * dy - ay * dx) / slope
         distance = (ax * by - ay * bx) / slope
-        return distance if distance > 0.0 and 0.0 <= along <= 1.0 else np.inf
+        return distance if distance > 0.0 and -1e-12 <= along <= 1.0 + 1e-12 else np.inf
     c = hit - segments.shape[0]
     cx, cy, radius = circles[c, 0], circles[c, 1], circles[c, 2]
     square, nearest = dx * dx + dy * dy, cx * dx + cy * dy
     root = nearest * nearest - square * (cx * cx + cy * cy - radius * radius)
-    return (nearest - np.sqrt(root)) / square if root >= 0.0 else np.inf
+    distance = (nearest - np.sqrt(max(root, 0.0))) / square
+    return distance if root >= 0.0 and distance > 0.0 else np.inf
+
+
+@kernel
+def _nearest(
+    dx: float, dy: float, left: int, right: int, segments: FloatArray, circles: FloatArray
+) -> tuple[float, int]:
+    """Nearer of two obstacles on a ray, or the nearest of all where the ray misses both, in the gap between them."""
+    nearest, hit = _distance(dx, dy, left, segments, circles), left
+    if right != left:
+        distance = _distance(dx, dy, right, segments, circles)
+        if distance < nearest:
+            nearest, hit = distance, right
+    if nearest == np.inf:
+        for candidate in range(segments.shape[0] + circles.shape[0]):
+            distance = _distance(dx, dy, candidate, segments, circles)
+            if distance < nearest:
+                nearest, hit = distance, candidate
+    return nearest, hit
 
 
 @kernel
@@ -115,11 +135,9 @@ def _render(
             depth[i, j] = -centre[2] / dz if dz < 0.0 else np.inf
             seen[i, j] = -1
             k = min(int(ray[i, j]), FAN_RAYS - 2)
-            for candidate in range(k, k + 2):
-                if candidate == k or hits[candidate] != hits[k]:
-                    distance = _distance(dx, dy, hits[candidate], segments, circles)
-                    if distance < depth[i, j]:
-                        depth[i, j], seen[i, j] = distance, hits[candidate]
+            nearest, hit = _nearest(dx, dy, hits[k], hits[k + 1], segments, circles)
+            if nearest < depth[i, j]:
+                depth[i, j], seen[i, j] = nearest, hit
 
 
 @kernel
@@ -134,13 +152,16 @@ def _paint(
     floor_frame: FloatArray,
     image: ByteArray,
 ) -> None:
-    """Fill the RGB image (H, W, 3): the colour of the obstacle seen or of the floor cell under the point seen."""
+    """Fill the RGB image (H, W, 3) with the colour of the obstacle or floor cell seen, black where neither is."""
     c, s = np.cos(xyt[2]), np.sin(xyt[2])
     for i in range(depth.shape[0]):
         for j in range(depth.shape[1]):
             if seen[i, j] >= 0:
                 for channel in range(3):
                     image[i, j, channel] = colours[seen[i, j], channel]
+                continue
+            if not np.isfinite(depth[i, j]):
+                image[i, j] = 0
                 continue
             px, py = centre[0] + depth[i, j] * directions[i, j, 0], centre[1] + depth[i, j] * directions[i, j, 1]
             column = np.floor((xyt[0] + c * px - s * py - floor_frame[0]) / floor_frame[2])
@@ -176,9 +197,9 @@ def render_colour(view: View, world: World, floor: FloorTexture, xyt: FloatArray
 
 def disparity_image(
     depth: FloatArray, calibration: DisparityCalibration, settings: KinectSettings, rng: np.random.Generator
-) -> IntArray:
-    """Turn depth (H, W) into the disparity image: d = (dd - offset) / slope, noisy, whole; 0 outside the depth range."""
+) -> npt.NDArray[np.uint16]:
+    """Turn depth (H, W) into the disparity image: d = (dd - offset) / slope, noisy, whole; 0 outside the range."""
     disparity = (calibration.depth_scale / depth - calibration.dd_offset) / calibration.dd_slope
     disparity += settings.sigma_disparity * rng.standard_normal(depth.shape)
     inside = (depth >= settings.range_min_m) & (depth < settings.range_max_m)
-    return np.asarray(np.where(inside, np.clip(np.round(disparity), 1, 65535), 0), dtype=np.int64)
+    return np.asarray(np.where(inside, np.clip(np.round(disparity), 1, 65535), 0), dtype=np.uint16)

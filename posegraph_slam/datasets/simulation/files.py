@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from posegraph_slam.arrays import ByteArray, IntArray
+from posegraph_slam.arrays import ByteArray
 from posegraph_slam.datasets.simulation import camera, robot, streams
 from posegraph_slam.datasets.simulation.floor import FloorTexture, build_floor
 from posegraph_slam.datasets.simulation.run import SimulatedRun, generator, simulate_run
@@ -35,14 +35,13 @@ def simulate(
 
     Also written: `world.json` (obstacles in the frame of the truth) and, with images, `floor.png` (its texture). All is
     written beside the folder first and moved into place at the end. The same settings give the same bytes. Raises
-    `InputError` if `folder` is a file, or holds anything and `overwrite` is not set.
+    `InputError` if `folder` is a file, or holds anything and `overwrite` is not set or it is no simulated log.
     """
-    folder = Path(folder)
+    folder = Path(folder).absolute()
     _check_target(folder, overwrite)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
     try:
-        unfinished.chmod(0o777 & ~_umask())
+        unfinished.mkdir(parents=True)
         run = simulate_run(settings, progress)
         _write_streams(run, unfinished)
         floor = _write_images(run, unfinished, progress) if settings.kinect.images else None
@@ -60,13 +59,8 @@ def _check_target(folder: Path, overwrite: bool) -> None:
         raise InputError(folder, "is a file", "name a new folder")
     if not overwrite and folder.exists() and any(folder.iterdir()):
         raise InputError(folder, "exists and is not empty", "name a new folder or allow to overwrite it")
-
-
-def _umask() -> int:
-    """Return the process's file mode mask, which can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    if folder.exists() and any(folder.iterdir()) and not (folder / "world.json").is_file():
+        raise InputError(folder, "holds other things than a simulated log", "name a new folder; it is not overwritten")
 
 
 def _write_streams(run: SimulatedRun, folder: Path) -> None:
@@ -112,18 +106,18 @@ def _write_images(run: SimulatedRun, folder: Path, progress: Progress) -> FloorT
     view = camera.disparity_view(calibration)
     for k, xyt in enumerate(run.motion.xyt_at(run.disparity_times_s), start=1):
         depth, _ = camera.render_depth(view, run.world, xyt)
-        image = camera.disparity_image(depth, calibration, settings, rng)
-        _write_png(folder / "dataRGBD" / f"Disparity{n}" / f"disparity{n}_{k}.png", image.astype(np.uint16))
+        disparity = camera.disparity_image(depth, calibration, settings, rng)
+        _write_png(folder / "dataRGBD" / f"Disparity{n}" / f"disparity{n}_{k}.png", disparity)
         progress("frames", k, total)
     view = camera.colour_view(calibration)
     for k, xyt in enumerate(run.motion.xyt_at(run.colour_times_s), start=1):
-        image = camera.render_colour(view, run.world, floor, xyt)
-        _write_png(folder / "dataRGBD" / f"RGB{n}" / f"rgb{n}_{k}.png", image[..., ::-1])
+        colours = camera.render_colour(view, run.world, floor, xyt)
+        _write_png(folder / "dataRGBD" / f"RGB{n}" / f"rgb{n}_{k}.png", colours[..., ::-1])
         progress("frames", len(run.disparity_times_s) + k, total)
     return floor
 
 
-def _write_png(path: Path, image: IntArray | ByteArray) -> None:
+def _write_png(path: Path, image: ByteArray | npt.NDArray[np.uint16]) -> None:
     """Write a grey 16-bit or BGR 8-bit image."""
     if not cv2.imwrite(str(path), np.ascontiguousarray(image), FAST_PNG):
         raise InputError(path, "cannot be written", "check the disk and the permissions")

@@ -12,7 +12,7 @@ from posegraph_slam.jit import kernel
 
 @kernel
 def _visit(low: float, high: float, start: float, increment: float, count: int, turn: int) -> tuple[int, int]:
-    """First and one past the last beam whose bearing, `turn` times round, lies in [low, high], and one beam of slack."""
+    """First and one past the last beam whose bearing, `turn` times round, lies in [low, high]; a beam of slack."""
     first = math.floor((low + turn * 2.0 * math.pi - start) / increment)
     last = math.ceil((high + turn * 2.0 * math.pi - start) / increment)
     return max(first, 0), min(last + 1, count)
@@ -32,7 +32,8 @@ def cast_fan(
     """Fill `ranges` (B,) and `hits` (B,) of the fan at (x, y) whose beam k has world bearing start + k increment.
 
     A hit is the number of the nearest obstacle, segments first, then circles; -1 and infinity where there is none.
-    The fan spans at most one turn. Each obstacle is tested only against the beams within its own angle, as a depth buffer does.
+    The fan spans at most one turn. Each obstacle is tested only against the beams within its own angle, as a depth
+    buffer does.
     """
     count = ranges.shape[0]
     start -= 2.0 * math.pi * math.floor((start + math.pi) / (2.0 * math.pi))
@@ -72,7 +73,7 @@ def cast_fan(
 
 @kernel
 def cast_scans(poses: FloatArray, fan: FloatArray, beams: int, segments: FloatArray, circles: FloatArray) -> FloatArray:
-    """Cast scans from `poses` (N, K, 3) [x, y, heading] of the sensor; return exact ranges (N, beams), infinite if none.
+    """Cast scans from `poses` (N, K, 3) [x, y, heading] of the sensor; return exact ranges (N, beams), inf if none.
 
     `fan` is [first bearing, increment] in the sensor frame. A scan is cut into K sectors of equal beams, each seen
     from its own pose (K = 1: the sensor stands still during the scan).

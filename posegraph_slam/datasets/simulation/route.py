@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -26,7 +27,7 @@ STOP_SHORT_M = 0.35
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Path:
-    """Samples of a smooth path: travelled distance (P,), position (P, 2) and heading (P,), unwrapped, of its tangent."""
+    """Samples of a smooth path: travelled distance (P,), position (P, 2) and unwrapped heading (P,) of its tangent."""
 
     distance_m: FloatArray
     position_m: FloatArray
@@ -108,7 +109,7 @@ def walk(net: Net, length_m: float, rng: np.random.Generator) -> list[Node]:
 
 def _home_length(net: Net, nodes: list[Node], before: Node, home: Node) -> float:
     way = [nodes[-1], *_way_home(net, nodes, before, home)]
-    return sum(net.length(a, b) for a, b in zip(way[:-1], way[1:], strict=True))
+    return sum(net.length(a, b) for a, b in pairwise(way))
 
 
 def _way_home(net: Net, nodes: list[Node], before: Node, home: Node) -> list[Node]:

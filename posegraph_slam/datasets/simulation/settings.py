@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from posegraph_slam.settings import Settings
 
@@ -32,14 +32,14 @@ class DriveSettings(Settings):
     acceleration_m_s2: float = Field(0.6, gt=0, le=5, description="Acceleration and braking")
     wander_m: float = Field(0.06, ge=0, le=0.15, description="Standard deviation of the path about the centre line")
     still_s: float = Field(3.0, ge=0, le=60, description="Standing still before the drive")
-    duration_s: float | None = Field(None, gt=0, description="Stop recording after this time; none: at the end")
+    duration_s: float | None = Field(None, ge=1, description="Stop recording after this time; none: at the end")
 
 
 class EncoderSettings(Settings):
     """Errors of the wheel encoders."""
 
     rate_hz: float = Field(40.0, gt=0, le=1000, description="Stamps a second")
-    sigma_scale: float = Field(0.01, ge=0, le=0.2, description="Scale error, drawn once for each side")
+    sigma_scale: float = Field(0.015, ge=0, le=0.2, description="Scale error, drawn once for each side")
     sigma_slip_m: float = Field(0.003, ge=0, le=0.1, description="Slip of each wheel after one metre (grows as root)")
 
 
@@ -49,7 +49,8 @@ class ImuSettings(Settings):
     rate_hz: float = Field(100.0, gt=0, le=2000, description="Stamps a second")
     sigma_bias_rad_s: float = Field(0.004, ge=0, le=0.2, description="Gyro bias, drawn once for each axis")
     sigma_gyro_rad_s: float = Field(0.005, ge=0, le=0.5, description="Noise of one gyro sample")
-    sigma_walk_rad_s: float = Field(0.0001, ge=0, le=0.05, description="Walk of the gyro bias after one second")
+    sigma_scale: float = Field(0.01, ge=0, le=0.2, description="Scale error of the gyro, drawn once")
+    sigma_walk_rad_s: float = Field(0.0003, ge=0, le=0.05, description="Walk of the gyro bias after one second")
     sigma_accelerometer_g: float = Field(0.003, ge=0, le=0.5, description="Noise of one accelerometer sample")
     missing_tail_s: float = Field(1.0, ge=0, le=60, description="The stream ends this much before the others")
 
@@ -76,11 +77,17 @@ class KinectSettings(Settings):
     range_max_m: float = Field(6.0, gt=0, le=50, description="Nothing farther than this has a disparity")
     floor_resolution_m: float = Field(0.02, gt=0, le=1, description="Cell of the floor's texture and of floor.png")
 
+    @model_validator(mode="after")
+    def _check_ranges(self) -> Self:
+        if self.range_min_m >= self.range_max_m:
+            raise ValueError(f"range_min_m {self.range_min_m:g} is not below range_max_m {self.range_max_m:g}")
+        return self
+
 
 class SimulationSettings(Settings):
     """One simulated log: a seed, a world, a drive and its sensors."""
 
-    seed: int = Field(20, ge=0, description="Same seed and settings: same bytes in every file")
+    seed: int = Field(24, ge=0, description="Same seed and settings: same bytes in every file")
     number: int = Field(1, ge=0, description="Number in the names of the files")
     start_epoch_s: float = Field(1.7e9, ge=0, description="Stamp of the begin, seconds")
     world: WorldSettings = WorldSettings()

@@ -48,14 +48,14 @@ def imu_samples(
 ) -> tuple[FloatArray, FloatArray]:
     """Measure angular velocity (n, 3) in rad/s and acceleration (n, 3) in g at the base, gravity upwards as +1 g on z.
 
-    The gyro has a bias that walks, and white noise. Acceleration is that of the drive and of its turns.
+    The gyro has a bias that walks, a scale error and white noise. Acceleration is that of the drive and of its turns.
     """
     rate = _yaw_rate(motion, times_s)
     period = np.diff(times_s, prepend=times_s[:1])
     bias = settings.sigma_bias_rad_s * rng.normal(size=3)
     walk = np.cumsum(settings.sigma_walk_rad_s * np.sqrt(period)[:, None] * rng.normal(size=(len(times_s), 3)), axis=0)
     gyro = bias + walk + settings.sigma_gyro_rad_s * rng.normal(size=(len(times_s), 3))
-    gyro[:, 2] += rate
+    gyro[:, 2] += (1.0 + settings.sigma_scale * rng.normal()) * rate
     half = 0.01
     speed_before, speed_after = (_speed(motion, times_s + shift) for shift in (-half, half))
     ahead = (speed_after - speed_before) / (2 * half) / STANDARD_GRAVITY

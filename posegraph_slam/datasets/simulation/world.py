@@ -127,8 +127,10 @@ def build_world(settings: WorldSettings, rng: np.random.Generator) -> World:
 def _draw_plan(settings: WorldSettings, rng: np.random.Generator) -> FloorPlan:
     """Place the corridors, draw the doors, and move the origin to the first door of the lowest corridor."""
     across, up, rooms = settings.blocks_across, settings.blocks_up, settings.rooms_across
-    x = np.arange(across + 1) * (rooms * settings.room_width_m + settings.corridor_width_m)
-    y = np.arange(up + 1) * (2 * settings.room_depth_m + settings.corridor_width_m)
+    x: FloatArray = np.arange(across + 1, dtype=np.float64) * (
+        rooms * settings.room_width_m + settings.corridor_width_m
+    )
+    y: FloatArray = np.arange(up + 1, dtype=np.float64) * (2 * settings.room_depth_m + settings.corridor_width_m)
     free = max(settings.room_width_m / 2 - settings.door_width_m / 2 - 0.35, 0.0)
     centres = x[:-1, None, None] + settings.corridor_width_m / 2 + (np.arange(rooms) + 0.5) * settings.room_width_m
     doors = centres + rng.uniform(-free, free, size=(across, up, rooms))
@@ -207,7 +209,7 @@ def _add_corridor_clutter(
     for vertical, lines, cross in ((False, plan.corridor_y, plan.corridor_x), (True, plan.corridor_x, plan.corridor_y)):
         for line, piece in np.ndindex(len(lines), len(cross) - 1):
             start, stop = float(cross[piece]) + half + 0.5, float(cross[piece + 1]) - half - 0.5
-            for _ in range(rng.poisson(0.3 * settings.clutter * max(stop - start, 0.0))):
+            for _ in range(rng.poisson(0.8 * settings.clutter * max(stop - start, 0.0))):
                 along, side = rng.uniform(start, stop), float(rng.choice([-1.0, 1.0]))
                 length, thick = rng.uniform(0.15, 0.4), rng.uniform(0.08, max(deepest, 0.09)) / 2
                 colour, doors = _draw_colour(rng), plan.door_x[:, max(line - 1, 0) : line + 1]
