@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from posegraph_slam.arrays import read_only
 from posegraph_slam.datasets.coverage import uneven_coverage
 from posegraph_slam.datasets.ece276a_frames import find_frames
 from posegraph_slam.datasets.npz import Archive
@@ -27,10 +28,13 @@ TRACK_WIDTH_M = 0.75
 
 Run 20 against its gyro gives 0.754 m and against its LiDAR path 0.748 m (least squares over turns of 1 to 5 s).
 """
-T_BASE_LIDAR = pose_from_rotation_translation(np.eye(3), np.array([0.133, 0.0, 0.514]))
-T_BASE_CAMERA = pose_from_rotation_translation(
-    Rotation.from_euler("xyz", [0.0, 0.36, 0.021]).as_matrix(), np.array([0.18, 0.005, 0.36])
+T_BASE_LIDAR = read_only(pose_from_rotation_translation(np.eye(3), np.array([0.133, 0.0, 0.514])))
+T_BASE_CAMERA = read_only(
+    pose_from_rotation_translation(
+        Rotation.from_euler("xyz", [0.0, 0.36, 0.021]).as_matrix(), np.array([0.18, 0.005, 0.36])
+    )
 )
+"""Roll 0, pitch 0.36 (the camera looks down), yaw 0.021 rad."""
 STREAMS = ("Encoders", "Imu", "Hokuyo", "Kinect")
 RUN_FILE = re.compile(r"(Encoders|Imu|Hokuyo)(\d*)\.npz")
 

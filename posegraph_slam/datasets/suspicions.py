@@ -27,7 +27,7 @@ def suspicious_clock(name: str, stamps_s: FloatArray) -> list[str]:
     back = steps < 0
     if back.any():
         found.append(
-            f"the {name} clock runs backwards {int(back.sum())} times, by up to {-steps.min():.3f} s: "
+            f"the {name} clock runs backwards {_times(int(back.sum()))}, by up to {-steps.min():.3f} s: "
             "the order of the log is kept"
         )
     ordered = np.sort(stamps_s)
@@ -61,7 +61,7 @@ def suspicious_ranges(scans: LaserScans) -> list[str]:
         found.append(f"{100 * dropouts:.1f} % of the beams are dropouts (below {scans.range_min_m:.2g} m)")
     broken = int(np.count_nonzero(~np.isfinite(ranges)))
     if broken:
-        found.append(f"{broken} ranges are NaN or infinite ({100 * broken / ranges.size:.2g} % of the beams)")
+        found.append(f"{broken} ranges are NaN or infinite ({100 * broken / ranges.size:.3g} % of the beams)")
     empty = int(np.count_nonzero(scans.returns().mean(axis=1) < EMPTY_SHARE))
     if empty:
         found.append(f"{empty} scans have returns on fewer than {100 * EMPTY_SHARE:.0f} % of their beams")
@@ -115,7 +115,7 @@ def suspicious_odometry(trajectory: Trajectory) -> list[str]:
     found = []
     if leaps.any():
         found.append(
-            f"odometry leaps {int(leaps.sum())} times between two poses (up to {distance.max():.2f} m, "
+            f"odometry leaps {_times(int(leaps.sum()))} between two poses (up to {distance.max():.2f} m, "
             f"{np.rad2deg(turn.max()):.0f} degrees; the first at pose {int(np.argmax(leaps)) + 1})"
         )
     if not distance.any() and not turn.any():
@@ -126,3 +126,7 @@ def suspicious_odometry(trajectory: Trajectory) -> list[str]:
 def _rotation(trajectory: Trajectory) -> slice:
     """The rotation in a tangent: last of SE(2), first of SE(3)."""
     return slice(2, 3) if trajectory.group.dimension == 2 else slice(0, 3)
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
