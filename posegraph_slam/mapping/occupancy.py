@@ -141,7 +141,7 @@ def _limits(settings: OccupancySettings, scans: LaserScans) -> BeamLimits:
     trusted = min(settings.max_range_m, scans.range_max_m)
     if shortest >= trusted:
         raise ConfigurationError(
-            "mapping.occupancy",
+            "mapping",
             f"no return is trusted: the shortest is {shortest} m and the longest {trusted} m",
             "check min_range_m and max_range_m against the sensor's limits",
         )

@@ -1,0 +1,36 @@
+"""Image files of the maps: the only place in this room that uses OpenCV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from posegraph_slam.arrays import ByteArray, read_only
+from posegraph_slam.errors import InputError
+from posegraph_slam.mapping.archive import replace_file
+
+
+def write_png(pixels: ByteArray, path: Path) -> None:
+    """Write (R, C) grey, (R, C, 3) RGB or (R, C, 4) RGBA pixels, top row first, as a PNG."""
+    if pixels.ndim == 3:
+        pixels = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2)  # OpenCV wants BGR
+    written, content = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    if not written:
+        raise InputError(path, f"pixels {pixels.shape} cannot be encoded as PNG")
+    replace_file(path, content.tobytes())
+
+
+def read_image(path: Path) -> ByteArray:
+    """Read an image as it is stored, 8 or 16 bits: (R, C) grey, (R, C, 3) RGB or (R, C, 4) RGBA, top row first."""
+    try:
+        content = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise InputError(path, f"cannot be opened ({error.strerror})") from error
+    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    if pixels is None:
+        raise InputError(path, "is not an image that can be decoded", "the file may be truncated or of another type")
+    if pixels.ndim == 3:
+        pixels = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2)
+    return read_only(pixels, pixels.dtype)
