@@ -1,0 +1,93 @@
+"""Every candidate that was tried, with its evidence and what became of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
+from posegraph_slam.loop_closure.matching import Evidence
+from posegraph_slam.loop_closure.proposals import Candidates
+from posegraph_slam.pose_graph.graph import ConstraintKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopRecord:
+    """One candidate: keyframes, kind, what was measured, and the decision; `reason` is empty where it was accepted.
+
+    `error_before_m` and `error_before_rad` say how far it lay from the estimate when it was found, `sigmas` how far
+    from the solved graph, in standard deviations (NaN where it never entered the graph).
+    """
+
+    round: int
+    target: int
+    source: int
+    kind: str
+    travel_m: float
+    reach_m: float
+    score: float
+    matched_fraction: float
+    agreement: float
+    overlap: float
+    rmse_m: float
+    error_before_m: float
+    error_before_rad: float
+    sigmas: float
+    accepted: bool
+    reason: str
+
+
+@dataclass(slots=True)
+class Ledger:
+    """Grows while candidates are tried; remembers which pairs need not be tried again."""
+
+    records: list[LoopRecord] = field(default_factory=list)
+    rows_in_graph: list[int] = field(default_factory=list)
+    _travel_tried: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    def untried(self, candidates: Candidates) -> IntArray:
+        """Candidates that are new, or whose uncovered travel has halved since, so that the guess is better now."""
+        keys = zip(candidates.target.tolist(), candidates.source.tolist(), strict=True)
+        last = [self._travel_tried.get(key, np.inf) for key in keys]
+        return np.flatnonzero(candidates.travel_m < 0.5 * np.array(last, dtype=np.float64))
+
+    def add(
+        self, round_: int, candidates: Candidates, evidence: Evidence, error_before: FloatArray, reasons: list[str]
+    ) -> None:
+        """Enter one row a candidate; those without a reason are taken to be in the graph, in this order."""
+        for m in range(len(candidates)):
+            key = (int(candidates.target[m]), int(candidates.source[m]))
+            self._travel_tried[key] = float(candidates.travel_m[m])
+            if not reasons[m]:
+                self.rows_in_graph.append(len(self.records))
+            self.records.append(
+                LoopRecord(
+                    round=round_,
+                    target=key[0],
+                    source=key[1],
+                    kind=ConstraintKind(int(candidates.kind[m])).name.lower(),
+                    travel_m=float(candidates.travel_m[m]),
+                    reach_m=float(candidates.reach_m[m]),
+                    score=float(evidence.score[m]),
+                    matched_fraction=float(evidence.matched_fraction[m]),
+                    agreement=float(evidence.agreement[m]),
+                    overlap=float(evidence.overlap[m]),
+                    rmse_m=float(evidence.rmse_m[m]),
+                    error_before_m=float(np.hypot(error_before[m, 0], error_before[m, 1])),
+                    error_before_rad=float(abs(error_before[m, 2])),
+                    sigmas=float("nan"),
+                    accepted=not reasons[m],
+                    reason=reasons[m],
+                )
+            )
+
+    def settle(self, sigmas: FloatArray, kept: BoolArray) -> None:
+        """Write how far the closures in the graph are from its solution, and drop those not kept."""
+        for k, row in enumerate(self.rows_in_graph):
+            old = self.records[row]
+            reason = "" if kept[k] else f"disagrees with the solved graph by {sigmas[k]:.1f} sigma"
+            values = {name: getattr(old, name) for name in LoopRecord.__slots__}
+            values.update(sigmas=float(sigmas[k]), accepted=bool(kept[k]), reason=reason)
+            self.records[row] = LoopRecord(**values)
+        self.rows_in_graph = [row for k, row in enumerate(self.rows_in_graph) if kept[k]]

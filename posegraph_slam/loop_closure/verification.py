@@ -1,0 +1,94 @@
+"""Accepting or rejecting registered candidates, each rejection with its reason."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import chi2 as chi2_distribution
+
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
+from posegraph_slam.geometry import SE2, Group
+from posegraph_slam.loop_closure.matching import Evidence
+from posegraph_slam.loop_closure.proposals import Candidates
+from posegraph_slam.loop_closure.settings import VerificationSettings
+
+NEIGHBOURHOOD_M = 15.0
+"""Candidates whose ends lie within this travel of each other are compared for consistency."""
+
+
+def rejection_reasons(candidates: Candidates, evidence: Evidence, settings: VerificationSettings) -> list[str]:
+    """Say for each candidate (M,) why its registration cannot be trusted, or the empty string."""
+    tests = (
+        (evidence.score < settings.score_min, "no pose in the window fits", evidence.score),
+        (evidence.overlap < settings.overlap_min, "too little overlap: {:.2f}", evidence.overlap),
+        (evidence.agreement < settings.agreement_min, "walls in free space: agreement {:.2f}", evidence.agreement),
+        (
+            evidence.matched_fraction < settings.matched_fraction_min,
+            "too few points match: {:.2f}",
+            evidence.matched_fraction,
+        ),
+        (evidence.rmse_m > settings.rmse_max_m, "residual too large: {:.3f} m", evidence.rmse_m),
+    )
+    reasons = [""] * len(candidates)
+    for failed, text, values in reversed(tests):
+        for m in np.flatnonzero(failed):
+            reasons[m] = text.format(values[m])
+    return reasons
+
+
+def count_support(
+    candidates: Candidates,
+    T_target_source: FloatArray,
+    poses: FloatArray,
+    path_m: FloatArray,
+    eligible: BoolArray,
+    settings: VerificationSettings,
+) -> tuple[IntArray, IntArray]:
+    """Count for each candidate (M,) the eligible ones nearby that agree, and those that disagree, with it.
+
+    Two closures and the estimated paths between their ends form a loop, which closes when both are right (pairwise
+    consistency, Mangelson et al. 2018). `poses` (K, 3, 3) in the same frame as the closures, `path_m` (K,).
+    """
+    agree, disagree = np.zeros(len(candidates), dtype=np.int64), np.zeros(len(candidates), dtype=np.int64)
+    rows = np.flatnonzero(eligible)
+    if len(rows) < 2:
+        return agree, disagree
+    ends = np.stack([path_m[candidates.target[rows]], path_m[candidates.source[rows]]], axis=1)
+    pairs = cKDTree(ends).query_pairs(NEIGHBOURHOOD_M, p=np.inf, output_type="ndarray")
+    a, b = rows[pairs[:, 0]], rows[pairs[:, 1]]
+    # neighbours that share an end, or nearly, see the same surfaces: they err together and prove nothing
+    apart = np.abs(path_m[candidates.source[a]] - path_m[candidates.source[b]]) > 0.5
+    a, b = a[apart], b[apart]
+    group: Group = SE2
+    across_a = group.between(poses[candidates.target[a]], poses[candidates.target[b]])
+    back_b = group.between(poses[candidates.source[b]], poses[candidates.source[a]])
+    around = group.inverse(T_target_source[a]) @ across_a @ T_target_source[b] @ back_b
+    error = group.log(around)
+    length = np.abs(path_m[candidates.target[a]] - path_m[candidates.target[b]]) + np.abs(
+        path_m[candidates.source[a]] - path_m[candidates.source[b]]
+    )
+    closes = (np.hypot(error[:, 0], error[:, 1]) < settings.consistency_m * (1 + 0.1 * length)) & (
+        np.abs(error[:, 2]) < settings.consistency_rad
+    )
+    np.add.at(agree, np.concatenate([a[closes], b[closes]]), 1)
+    np.add.at(disagree, np.concatenate([a[~closes], b[~closes]]), 1)
+    return agree, disagree
+
+
+def consistency_reasons(
+    candidates: Candidates, agree: IntArray, disagree: IntArray, settings: VerificationSettings
+) -> list[str]:
+    """Say for each candidate (M,) why the others speak against it, or the empty string."""
+    reasons = [""] * len(candidates)
+    wide = candidates.reach_m > settings.trusted_drift_m
+    for m in np.flatnonzero(wide & (agree < settings.support_min)):
+        reasons[m] = f"found in a wide window and supported by {agree[m]} others"
+    for m in np.flatnonzero(disagree > agree):
+        reasons[m] = f"{disagree[m]} nearby candidates disagree, {agree[m]} agree"
+    return reasons
+
+
+def chi2_gate(sigma: float, dof: int) -> float:
+    """Return the chi-square that a right constraint of `dof` dimensions exceeds as rarely as a Gaussian `sigma`s."""
+    tail = chi2_distribution.sf(sigma**2, 1)
+    return float(chi2_distribution.isf(tail, dof))
