@@ -17,6 +17,9 @@ LINE_TOLERANCE = 1e-12
 USUAL_THICKNESSES = 2.0
 """Thickness, in medians of the cloud, at which a fitted line or plane is trusted by half."""
 
+THINNEST_M = 1e-6
+"""Thickness under which differences are rounding: a variance of zero comes out as 1e-16 of the neighbourhood's."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Surface:
@@ -98,7 +101,7 @@ def fit_surface(points: FloatArray, tree: cKDTree, neighbours: int) -> Surface:
     # the fit spends d degrees of freedom on k points
     thickness = np.sqrt(np.maximum(values[:, 0], 0.0) * k / max(k - d, 1))
     usual = float(np.median(thickness[oriented])) if oriented.any() else 0.0
-    trust = oriented / (1.0 + (thickness / max(USUAL_THICKNESSES * usual, 1e-9)) ** 2)
+    trust = oriented / (1.0 + (thickness / max(USUAL_THICKNESSES * usual, THINNEST_M)) ** 2)
     return Surface(anchors=anchors, normals=normals, oriented=oriented, thickness_m=thickness, trust=trust,
                    neighbours=index)  # fmt: skip
 

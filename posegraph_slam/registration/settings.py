@@ -62,7 +62,7 @@ class IcpSettings(Settings):
     """A direction whose share of the Hessian's largest eigenvalue is smaller counts as free."""
     sigma_floor_m: float = Field(default=1e-3, gt=0)
     """The residuals' standard deviation is taken as no smaller, so that perfect data are not infinitely certain."""
-    free_sigma_m: float = Field(default=10.0, gt=0)
+    free_sigma_m: float = Field(default=1.0, gt=0)
     """Standard deviation given to directions that the points leave free: the floor under the information."""
 
     @classmethod

@@ -89,11 +89,11 @@ def information_of(evidence: Evidence, surface: Surface, settings: IcpSettings) 
     weighted = evidence.jacobian * evidence.weights[:, None]
     basis, values, free = split_directions(evidence.jacobian.T @ weighted, settings.degeneracy_ratio)
     scores = weighted @ basis
-    neighbours, thickness = surface.neighbours[evidence.target], surface.thickness_m[evidence.target]
+    thickness = surface.thickness_m[evidence.target]
     by_pair = evidence.slope * scores * _sigma(thickness, settings)  # a score follows noise with the loss's curvature
-    by_target = spread_over_neighbours(by_pair, neighbours, len(surface.thickness_m))
+    by_target = scores_of_targets(by_pair, evidence.target, surface.neighbours, surface.normals)
     by_source = scores * _sigma(evidence.residuals_m, settings)
-    k = neighbours.shape[1]  # the residuals hold the noise of an anchor too, 1/k of a point's
+    k = surface.neighbours.shape[1]  # the residuals hold the noise of an anchor too, 1/k of a point's
     middle = by_source.T @ by_source * (k / (k + 1)) + by_target.T @ by_target
     freedom = len(scores) / max(len(scores) - len(values), 1)
     inverse = 1.0 / (evidence.slope * values)
@@ -114,11 +114,20 @@ def _sigma(deviation_m: FloatArray, settings: IcpSettings) -> FloatArray:
 
 
 @kernel
-def spread_over_neighbours(scores: FloatArray, neighbours: IntArray, count: int) -> FloatArray:
-    """Add each score (m, k) in equal shares to the points named by its row of `neighbours` (m, j): (count, k)."""
-    result = np.zeros((count, scores.shape[1]))
-    for row in range(neighbours.shape[0]):
-        for j in range(neighbours.shape[1]):
+def scores_of_targets(scores: FloatArray, target: IntArray, neighbours: IntArray, normals: FloatArray) -> FloatArray:
+    """Score (n, k) of each target point's noise along its normal, from those of the pairs (m, k) that lean on it.
+
+    A pair with target point t leans in equal shares on `neighbours[t]`; noise along the normal n_j of one of them
+    moves its residual by n_t . n_j, which also settles the arbitrary signs of the normals.
+    """
+    result = np.zeros((neighbours.shape[0], scores.shape[1]))
+    for row in range(len(target)):
+        t = target[row]
+        for j in neighbours[t]:
+            share = 0.0
+            for a in range(normals.shape[1]):
+                share += normals[t, a] * normals[j, a]
+            share /= neighbours.shape[1]
             for a in range(scores.shape[1]):
-                result[neighbours[row, j], a] += scores[row, a] / neighbours.shape[1]
+                result[j, a] += share * scores[row, a]
     return result

@@ -1,0 +1,86 @@
+"""Whether the returned information tells the truth, and what a corridor leaves open."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.linalg import subspace_angles
+from scipy.stats import chi2
+
+from posegraph_slam.geometry import SE2, SE3, pose_from_xyt
+from posegraph_slam.registration import IcpSettings, RegistrationStatus, icp
+
+TRIALS = 200
+
+
+@pytest.mark.parametrize(("beams", "sigma_m"), [(181, 0.01), (361, 0.01)])
+def test_information_is_calibrated_in_rooms(beams: int, sigma_m: float, simulated: SimpleNamespace) -> None:
+    rng, nees = np.random.default_rng(1), []
+    for _ in range(TRIALS):
+        at = pose_from_xyt(np.r_[rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3)])
+        truth = pose_from_xyt(np.r_[rng.uniform(-0.15, 0.15, 2), rng.uniform(-0.1, 0.1)])
+        target = simulated.scan(at, simulated.room, beams, sigma_m, rng)
+        source = simulated.scan(at @ truth, simulated.room, beams, sigma_m, rng)
+        result = icp(source, target, truth @ SE2.exp(rng.normal(0, [0.05, 0.05, 0.03])))
+        assert result.usable
+        error = SE2.local(result.T_target_source, truth)
+        nees.append(float(error @ result.information @ error))
+    low, high = chi2.ppf([0.025, 0.975], 3 * TRIALS) / TRIALS
+    assert low < np.mean(nees) < high
+
+
+@pytest.mark.parametrize("settings", [IcpSettings.point_to_line(), IcpSettings.point_to_point()], ids=["line", "point"])
+def test_a_corridor_is_free_along_itself(settings: IcpSettings, simulated: SimpleNamespace) -> None:
+    rng = np.random.default_rng(2)
+    turned = pose_from_xyt(np.array([0, 0, 0.4]))
+    target = simulated.scan(turned, simulated.corridor, 361, 0.005, rng, 8.0)
+    source = simulated.scan(
+        turned @ pose_from_xyt(np.array([0.03, 0.02, 0.01])), simulated.corridor, 361, 0.005, rng, 8
+    )
+    result = icp(source, target, np.eye(3), settings)
+    assert result.usable
+    assert result.degenerate
+    assert result.degenerate_directions.shape == (1, 3)
+    along = np.array([np.cos(-0.4), np.sin(-0.4), 0])
+    assert abs(result.degenerate_directions[0] @ along) > 0.99
+    covariance = np.linalg.inv(result.information)
+    assert np.sqrt(along @ covariance @ along) > 0.9
+    across = np.array([-along[1], along[0], 0])
+    assert np.sqrt(across @ covariance @ across) < 0.02  # the walls' own direction is known to half a degree
+    if settings.residual.value == "point_to_plane":  # what the walls do not tell stays as it was guessed
+        assert abs(along @ SE2.log(result.T_target_source)) < 0.005  # of 0.02 m travelled along it
+
+
+def test_a_floor_leaves_three_directions_free() -> None:
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-2, 2, (600, 2)), rng.normal(0, 0.002, 600)])
+    guess = SE3.exp(np.array([0.02, -0.01, 0.1, 0.05, 0.03, 0.04]))
+    result = icp(floor, floor, guess)
+    assert result.usable
+    assert len(result.degenerate_directions) == 3
+    free = np.zeros((3, 6))
+    free[0, 2] = free[1, 3] = free[2, 4] = 1.0  # yaw, x, y
+    assert subspace_angles(result.degenerate_directions.T, free.T).max() < 0.1
+
+
+def test_information_is_never_without_limit_or_the_identity(simulated: SimpleNamespace) -> None:
+    exact = simulated.scan(np.eye(3), simulated.room, 361, 0.0, np.random.default_rng(0))
+    result = icp(exact, exact, np.eye(3))
+    values = np.linalg.eigvalsh(result.information)
+    assert result.status is RegistrationStatus.CONVERGED
+    assert 1.0 < values[0] < values[-1] < 361 * 30.0**2 / IcpSettings().sigma_floor_m ** 2
+    np.testing.assert_array_equal(result.information, result.information.T)
+
+
+def test_more_noise_means_less_information(simulated: SimpleNamespace) -> None:
+    sizes = []
+    for sigma in (0.005, 0.01, 0.02):
+        rng = np.random.default_rng(5)
+        clouds = [simulated.scan(np.eye(3), simulated.room, 361, sigma, rng) for _ in range(2)]
+        sizes.append(np.linalg.det(icp(*clouds, np.eye(3)).information))
+    # three directions, each with the inverse square of the noise: 4^3 a doubling
+    ratios = np.array(sizes[:-1]) / sizes[1:]
+    assert (ratios > 4.0**3 / 3).all()
+    assert (ratios < 4.0**3 * 3).all()

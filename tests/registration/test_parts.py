@@ -1,0 +1,145 @@
+"""The parts of the loop one at a time: surfaces, association, rejection, steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from posegraph_slam.geometry import SE2, SE3, Group, align_points
+from posegraph_slam.registration.cloud import neighbourhood_moments, prepare_cloud
+from posegraph_slam.registration.icp import has_settled
+from posegraph_slam.registration.pairing import (
+    Pairs,
+    is_reciprocal,
+    nearest_pairs,
+    normal_angle_test,
+    place,
+    trimming_test,
+)
+from posegraph_slam.registration.residuals import PointToPlane, PointToPoint, linearise, plane_residuals
+from posegraph_slam.registration.settings import IcpSettings
+
+spaces = pytest.mark.parametrize("group", [SE2, SE3], ids=["2d", "3d"])
+
+
+@spaces
+def test_surface_agrees_with_singular_values(group: Group) -> None:
+    points = np.random.default_rng(0).normal(size=(60, group.dimension))
+    cloud = prepare_cloud(points, neighbours=8)
+    for row in range(0, 60, 7):
+        nearest = np.argsort(np.linalg.norm(points - points[row], axis=1))[:8]
+        around = points[nearest]
+        _, S, Vt = np.linalg.svd(around - around.mean(axis=0))
+        assert abs(Vt[-1] @ cloud.surface.normals[row]) == pytest.approx(1.0)
+        assert cloud.surface.thickness_m[row] == pytest.approx(S[-1] / np.sqrt(8 - group.dimension))
+        np.testing.assert_allclose(cloud.surface.anchors[row], around.mean(axis=0), atol=1e-12)
+
+
+@spaces
+def test_normals_of_a_round_thing_point_outward(group: Group) -> None:
+    points = np.random.default_rng(0).normal(size=(3000, group.dimension))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    cosine = np.abs(np.sum(prepare_cloud(points + 5.0).surface.normals * points, axis=1))
+    assert np.quantile(cosine, 0.01) > 0.99
+
+
+def test_moments_keep_their_digits_far_away() -> None:
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    index = np.tile(np.arange(20), (20, 1))
+    near, far = neighbourhood_moments(points, index), neighbourhood_moments(points + 2.0**20, index)
+    np.testing.assert_allclose(far[1], near[1], atol=1e-9)
+
+
+def test_corners_are_trusted_less_than_walls() -> None:
+    wall = np.column_stack([np.linspace(-2, 2, 200), np.zeros(200)])
+    corner = np.column_stack([np.full(100, 2.0), np.linspace(0.02, 2, 100)])
+    noise = np.random.default_rng(0).normal(scale=0.003, size=(300, 2))
+    trust = prepare_cloud(np.vstack([wall, corner]) + noise).surface.trust
+    assert trust[198:202].max() < 0.3
+    assert np.median(trust) > 0.6
+
+
+@spaces
+def test_association_is_that_of_brute_force(group: Group) -> None:
+    rng = np.random.default_rng(1)
+    source, target = rng.normal(size=(80, group.dimension)), rng.normal(size=(50, group.dimension))
+    scene = place(prepare_cloud(source), prepare_cloud(target), group.exp(np.full(group.dof, 0.2)))
+    pairs = nearest_pairs(scene, 0.6)
+    distance = np.linalg.norm(scene.moved[:, None] - target[None], axis=2)
+    inside = np.flatnonzero(distance.min(axis=1) <= 0.6)
+    np.testing.assert_array_equal(pairs.source, inside)
+    np.testing.assert_array_equal(pairs.target, distance.argmin(axis=1)[inside])
+    np.testing.assert_allclose(pairs.distance_m, distance.min(axis=1)[inside])
+    backward = distance.argmin(axis=0)[pairs.target] == pairs.source
+    np.testing.assert_array_equal(is_reciprocal(scene, pairs), backward)
+    assert 0 < backward.sum() < len(backward)
+
+
+def test_a_pair_at_the_gate_is_in() -> None:
+    cloud = prepare_cloud(np.array([[0.0, 0], [1, 0], [0, 1]]))
+    moved = place(prepare_cloud(cloud.points + np.array([-0.25, 0])), cloud, np.eye(3))
+    assert len(nearest_pairs(moved, 0.25)) == 3
+    assert len(nearest_pairs(moved, np.nextafter(0.25, 0))) == 0
+
+
+def test_trimming_keeps_the_nearest_share() -> None:
+    distance = np.array([0.5, 0.1, 0.4, 0.2, 0.3])
+    pairs = Pairs(source=np.arange(5), target=np.arange(5), distance_m=distance)
+    cloud = prepare_cloud(np.zeros((5, 2)))
+    scene = place(cloud, cloud, np.eye(3))
+    np.testing.assert_array_equal(trimming_test(0.6)(scene, pairs), [False, True, False, True, True])
+    np.testing.assert_array_equal(trimming_test(0.01)(scene, pairs), [False, True, False, False, False])
+
+
+def test_normals_are_compared_without_their_signs() -> None:
+    along_x = np.column_stack([np.linspace(0, 1, 20), np.zeros(20)])
+    cloud, row = prepare_cloud(along_x, neighbours=5), np.arange(20)
+    pairs = Pairs(source=row, target=row, distance_m=np.zeros(20))
+    for angle, stays in ((0.3, True), (-0.3, True), (np.pi - 0.3, True), (0.5, False), (np.pi / 2, False)):
+        scene = place(cloud, cloud, SE2.exp(np.array([0, 0, angle])))
+        assert normal_angle_test(0.4)(scene, pairs).all() == stays
+
+
+@spaces
+def test_the_jacobian_is_the_derivative(group: Group) -> None:
+    rng, h = np.random.default_rng(2), 1e-6
+    source, target = (
+        prepare_cloud(rng.normal(size=(40, group.dimension)) + 3),
+        prepare_cloud(rng.normal(size=(40, group.dimension))),
+    )
+    T = group.exp(rng.normal(size=group.dof))
+    pairs = Pairs(source=rng.permutation(40), target=rng.permutation(40), distance_m=np.zeros(40))
+    frame, jacobian = linearise(place(source, target, T), pairs)
+    for axis, step in enumerate(frame.to_origin.T):
+        ahead, behind = (plane_residuals(place(source, target, group.retract(T, s * h * step)), pairs) for s in (1, -1))
+        np.testing.assert_allclose(jacobian[:, axis], (ahead - behind) / (2 * h), atol=1e-8)
+
+
+@spaces
+def test_a_plane_step_reaches_the_minimum_of_its_linear_cost(group: Group) -> None:
+    rng = np.random.default_rng(4)
+    source, target = (prepare_cloud(rng.normal(size=(60, group.dimension))) for _ in range(2))
+    pairs = Pairs(source=np.arange(60), target=rng.permutation(60), distance_m=np.zeros(60))
+    scene, weights = place(source, target, group.identity()), rng.uniform(0.1, 1, 60)
+    better = PointToPlane(1e-9).improve(scene, pairs, weights)
+    assert better is not None
+    frame, jacobian = linearise(scene, pairs)
+    root = np.sqrt(weights)
+    expected, *_ = np.linalg.lstsq(jacobian * root[:, None], -plane_residuals(scene, pairs) * root, rcond=None)
+    np.testing.assert_allclose(group.log(better), frame.to_origin @ expected, atol=1e-9)
+
+
+def test_a_point_step_is_the_closed_form() -> None:
+    rng = np.random.default_rng(4)
+    source, target = (prepare_cloud(rng.normal(size=(30, 3))) for _ in range(2))
+    pairs = Pairs(source=np.arange(30), target=np.arange(30)[::-1], distance_m=np.zeros(30))
+    better = PointToPoint().improve(place(source, target, np.eye(4)), pairs, np.ones(30))
+    np.testing.assert_allclose(better, align_points(source.points, target.points[::-1])[0])
+
+
+@pytest.mark.parametrize(("step", "settled"), [
+    ([9e-4, 0, 0], True), ([1.1e-3, 0, 0], False), ([0, 0, 0.019], True), ([0, 0, 0.021], False),
+])  # fmt: skip
+def test_turning_and_moving_end_the_loop_apart(step: list[float], settled: bool) -> None:
+    settings = IcpSettings(rotation_tolerance_rad=0.02, translation_tolerance_m=1e-3)
+    assert has_settled(np.eye(3), SE2.exp(np.array(step)), settings) is settled
