@@ -50,7 +50,7 @@ test: lint
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadfile
 
 benchmark: $(VENV)/.installed-dev
-	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
+	@for script in $(wildcard benchmarks/*.py); do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
 
 lock: $(VENV)/.installed-dev
 	@$(BIN)/python tools/lock.py > constraints.txt.new && mv constraints.txt.new constraints.txt
