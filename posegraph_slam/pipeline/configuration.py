@@ -12,6 +12,7 @@ from pydantic import Field
 
 from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.mapping.occupancy import OccupancySettings
+from posegraph_slam.mapping.texture import TextureSettings
 from posegraph_slam.odometry.settings import OdometrySettings
 from posegraph_slam.pipeline.settings_files import Layer, build_settings, parse_override, read_layer
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
@@ -28,6 +29,7 @@ class Configuration(Settings):
     odometry: OdometrySettings = OdometrySettings()
     pose_graph: SolverSettings = SolverSettings()
     mapping: OccupancySettings = OccupancySettings()
+    texture: TextureSettings = TextureSettings()
 
 
 def preset_folder() -> Path:

@@ -29,8 +29,8 @@ def draw_figures(result: OptimizationResult, directory: RunDirectory) -> None:
     if result.texture is not None:
         draw_texture(
             result.texture.geometry,
-            result.texture.colours,
-            result.texture.covered,
+            result.texture.colour,
+            result.texture.observed,
             directory.path("figures/texture.png"),
             trajectory=result.trajectory,
         )
