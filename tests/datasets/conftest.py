@@ -56,7 +56,7 @@ def flaser(
     k: int, beams: int = 180, *, offset: float = 0.1, name: str = "FLASER", yaw: float = 0.0, far: float = 81.83
 ) -> str:
     """One laser message: the robot on a circle, the laser `offset` ahead of it, every tenth beam without return."""
-    theta = 0.1 * k
+    theta = 0.1234567 * k  # headings whose sixth digit is rounded up and down
     robot = (np.cos(theta), np.sin(theta), theta + 0.5)
     laser = (robot[0] + offset * np.cos(robot[2]), robot[1] + offset * np.sin(robot[2]), robot[2] + yaw)
     ranges = [f"{far:.2f}" if (b + k) % 10 == 0 else f"{1 + 0.01 * ((b * 7 + k) % 300):.2f}" for b in range(beams)]

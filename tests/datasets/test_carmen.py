@@ -33,7 +33,8 @@ def test_the_first_triple_is_the_laser_and_the_second_the_robot(carmen_lines: Li
     np.testing.assert_allclose(scans_of(log).T_base_lidar[:, 3], [0.12, 0, 0, 1], atol=1e-6)
     assert log.scan_odometry is not None
     k = np.arange(20)
-    expected = np.stack([np.cos(0.1 * k), np.sin(0.1 * k), 0.1 * k + 0.5], axis=1)
+    turn = 0.1234567 * k
+    expected = np.stack([np.cos(turn), np.sin(turn), turn + 0.5], axis=1)
     np.testing.assert_allclose(log.scan_odometry.poses, pose_from_xyt(expected), atol=1e-6)
     np.testing.assert_allclose(scans_of(log).stamps_s, 1000 + 0.2 * k, atol=1e-9)
     assert (log.scan_odometry.parent, log.scan_odometry.child) == ("odom", "base")
@@ -86,13 +87,20 @@ def test_the_no_return_value_is_recognised(far: float, carmen_lines: Lines, tmp_
     assert any("mean no return (10.0 % of the beams)" in remark for remark in log.remarks)
 
 
+def test_every_code_of_a_sick_laser_means_no_return(carmen_lines: Lines, tmp_path: Path) -> None:
+    words = carmen_lines["flaser"](1).split()
+    words[2:7] = ["79.99", "81.83", "81.87", "81.90", "81.91"]
+    scans = scans_of(read_lines(carmen_lines, tmp_path, [" ".join(words)]))
+    np.testing.assert_array_equal(scans.returns()[0, :5], [True, False, False, False, False])
+
+
 def test_a_far_wall_is_not_taken_for_no_return(carmen_lines: Lines, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     lines = []
     for k in range(30):
         words = carmen_lines["flaser"](k).split()
         words[2:182] = [f"{value:.2f}" for value in rng.uniform(1, 3, 180)]
-        words[82:92] = [f"{value:.2f}" for value in rng.normal(12.0, 0.01, 10)]
+        words[82:92] = [f"{value:.2f}" for value in rng.choice([11.98, 11.99, 12.0], 10)]
         lines.append(" ".join(words))
     scans = scans_of(read_lines(carmen_lines, tmp_path, lines))
     assert scans.returns().all()
@@ -117,7 +125,8 @@ def test_inconsistent_laser_poses_leave_the_mounting_to_the_parameters(carmen_li
 
 @pytest.mark.parametrize("yaw", [np.pi, 0.0])
 def test_the_rear_laser_looks_backwards(yaw: float, carmen_lines: Lines, tmp_path: Path) -> None:
-    lines = ["PARAM robot_rearlaser_offset 0.2 h 0"]
+    # Only where the poses say nothing of the direction does the parameter count.
+    lines = [f"PARAM robot_rearlaser_offset {0.2 if yaw == 0 else 0.9} h 0"]
     lines += [carmen_lines["flaser"](k, name="RLASER", offset=-0.2, yaw=yaw) for k in range(60)]
     T = scans_of(read_lines(carmen_lines, tmp_path, lines)).T_base_lidar
     x, y, theta = xyt_from_pose(T)
@@ -225,8 +234,10 @@ def test_a_malformed_line_is_named(break_line: Callable[[str], str], carmen_line
 
 def test_a_missing_range_in_one_line_is_not_filled_from_the_next(carmen_lines: Lines, tmp_path: Path) -> None:
     lines = [carmen_lines["flaser"](k, 20) for k in range(4)]
-    lines[1] = lines[1].replace(" 1.08", "", 1)
-    lines[2] = lines[2].replace(" 1.09", " 1.09 1.09", 1)
+    # As many spaces and, together, as many numbers as two whole lines have.
+    lines[1] = lines[1].replace(" 1.08 ", "  ", 1)
+    lines[2] = lines[2].replace(" 1.09 ", " 1.09\t1.09 ", 1)
+    assert len(f"{lines[1]} {lines[2]}".split()) == 2 * len(lines[0].split())
     with pytest.raises(InputError, match=r"a\.clf:2: malformed FLASER message"):
         read_lines(carmen_lines, tmp_path, lines)
 
