@@ -65,7 +65,7 @@ class Cloud:
         return int(self.points.shape[1])
 
 
-def prepare_cloud(points: FloatArray, *, neighbours: int = 16) -> Cloud:
+def prepare_cloud(points: FloatArray, *, neighbours: int = 10) -> Cloud:
     """Build the KD-tree of points (n, 2) or (n, 3) and fit a line or plane to the `neighbours` nearest of each.
 
     Raises `InputError` if the array has another shape or holds values that are not finite.

@@ -56,7 +56,7 @@ class IcpSettings(Settings):
     """Fewer pairs than this end in a failure."""
     min_inlier_fraction: float = Field(default=0.1, ge=0, le=1)
     """A smaller share of paired source points ends in a failure."""
-    normal_neighbours: int = Field(default=16, ge=3, le=1000)
+    normal_neighbours: int = Field(default=10, ge=3, le=1000)
     """Nearest points, itself among them, to which the tangent line or plane at a point is fitted."""
     degeneracy_ratio: float = Field(default=0.01, gt=0, lt=1)
     """A direction whose share of the Hessian's largest eigenvalue is smaller counts as free."""
