@@ -37,7 +37,7 @@ def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name, array in arrays.items():
             member = io.BytesIO()
-            np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+            np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
             info = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
             info.compress_type, info.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
             archive.writestr(info, member.getvalue())
@@ -81,14 +81,17 @@ def read_occupancy(path: Path) -> OccupancyGrid:
     """Read a grid that `write_occupancy` wrote; it is the same to the last bit."""
     names = ("format_version", "origin_m", "resolution_m", "yaw_rad", "log_odds", "observed")
     arrays = read_npz(path, names)
-    if arrays["format_version"] != FORMAT_VERSION:
+    if arrays["format_version"].shape != () or arrays["format_version"] != FORMAT_VERSION:
         raise InputError(path, f"has format version {arrays['format_version']}, not {FORMAT_VERSION}")
-    if arrays["log_odds"].ndim != 2 or arrays["log_odds"].shape != arrays["observed"].shape:
-        raise InputError(path, f"log_odds {arrays['log_odds'].shape} and observed {arrays['observed'].shape} differ")
+    shape = arrays["log_odds"].shape
+    wanted = {"origin_m": (2,), "resolution_m": (), "yaw_rad": (), "observed": shape}
+    wrong = [f"{name} has shape {arrays[name].shape}" for name, want in wanted.items() if arrays[name].shape != want]
+    if len(shape) != 2 or wrong:
+        raise InputError(path, f"log_odds has shape {shape}" + "".join(f", {text}" for text in wrong), "make it again")
     geometry = GridGeometry(
         origin_m=arrays["origin_m"],
         resolution_m=float(arrays["resolution_m"]),
-        shape=arrays["log_odds"].shape,
+        shape=(shape[0], shape[1]),
         yaw_rad=float(arrays["yaw_rad"]),
     )
     return OccupancyGrid(geometry=geometry, log_odds=arrays["log_odds"], observed=arrays["observed"])

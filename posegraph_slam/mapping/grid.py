@@ -54,9 +54,10 @@ class GridGeometry:
         points = np.asarray(points_m, dtype=np.float64).reshape(-1, 2)
         if len(points) == 0 or not np.isfinite(points).all():
             raise InputError("grid geometry", "the points to hold are none or not finite", "check the trajectory")
-        low = np.floor((points.min(axis=0) - margin_m) / resolution_m)
-        # The cell of a point on a line is the one above it: floor + 1, not ceil.
-        high = np.floor((points.max(axis=0) + margin_m) / resolution_m) + 1
+        # A millionth of a cell more on every side, so that rounding leaves no point outside; and the cell of a point
+        # on a line is the one above it: floor + 1, not ceil.
+        low = np.floor((points.min(axis=0) - margin_m) / resolution_m - 1e-6)
+        high = np.floor((points.max(axis=0) + margin_m) / resolution_m + 1e-6) + 1
         columns, rows = (high - low).tolist()
         return cls(origin_m=low * resolution_m, resolution_m=resolution_m, shape=(int(rows), int(columns)))
 

@@ -101,7 +101,7 @@ def build_occupancy(
     settings = settings or OccupancySettings()
     T_map_lidar = _planar_sensor_poses(scans, trajectory)
     steps, clamp, unit = _steps(settings, weights, len(scans))
-    ranges = scans.ranges_m[:, :: settings.beam_stride]
+    ranges = read_only(scans.ranges_m[:, :: settings.beam_stride], np.float32)
     angles = scans.angles_rad[:: settings.beam_stride]
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     limits = _limits(settings, scans)
