@@ -1,5 +1,6 @@
 """Lie groups on stacked arrays, rigid alignment, interpolation and trajectories."""
 
+from posegraph_slam.geometry.deformation import deform
 from posegraph_slam.geometry.groups import SE2, SE3, SO2, SO3, Group
 from posegraph_slam.geometry.interpolation import interpolate
 from posegraph_slam.geometry.kabsch import align_points
@@ -25,6 +26,7 @@ __all__ = [
     "Relations",
     "Trajectory",
     "align_points",
+    "deform",
     "interpolate",
     "inverse_pose",
     "planar_from_spatial",

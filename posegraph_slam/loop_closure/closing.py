@@ -31,7 +31,6 @@ from posegraph_slam.pose_graph.solver_settings import SolveResult, SolverSetting
 from posegraph_slam.registration.beam_information import information_in_base, information_with_floor
 from posegraph_slam.registration.beam_scans import BeamScans
 
-
 SETTLING_ROUNDS = 12
 """Solutions at most until the set of closures that agree stays the same."""
 WORST_SHARE = 0.25

@@ -14,7 +14,6 @@ from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.loop_closure.settings import ProposalSettings
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
 
-
 PLACES_AT_ONCE = 256
 """Places from which travel is measured in one call."""
 

@@ -13,10 +13,12 @@ from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_
 from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt, xyt_from_pose
 from posegraph_slam.odometry.estimate import OdometryEstimate, covariance_between
 from posegraph_slam.odometry.local_map import STATISTICS, track
-from posegraph_slam.registration.beam_information import information_in_base, information_with_floor
+from posegraph_slam.odometry.scan_to_scan import chain_by_icp
+from posegraph_slam.registration.beam_information import information_in_base, information_with_floor, inverse
 from posegraph_slam.registration.beam_matching import BeamMatchSettings
 from posegraph_slam.registration.beam_scans import BeamScans
 from posegraph_slam.registration.local_search import LocalSearchSettings
+from posegraph_slam.registration.settings import IcpSettings
 from posegraph_slam.settings import Settings
 
 
@@ -42,6 +44,9 @@ class ScanMatchingSettings(Settings):
     """The motion between keyframes is not known better than this, whatever the number of points says."""
     covariance_floor_rad: float = Field(default=0.003, gt=0)
     match: BeamMatchSettings = BeamMatchSettings()
+    """Matching of a scan to the local map."""
+    icp: IcpSettings = IcpSettings()
+    """Registration of a scan to the one before it (`scan_to_scan`)."""
     search: LocalSearchSettings = LocalSearchSettings()
 
 
@@ -81,9 +86,7 @@ def match_scans(
     if settings.matcher == "local_map":
         result = _track_local_map(scans, odometry, settings)
     elif settings.matcher == "scan_to_scan":
-        from posegraph_slam.odometry.scan_to_scan import chain_scans
-
-        result = chain_scans(scans, odometry, settings, executor=executor or SerialExecutor(), progress=progress)
+        result = _chain_scans(scans, odometry, settings, executor or SerialExecutor(), progress)
     else:
         result = _odometry_alone(odometry, settings)
     progress("scan matching", len(scans), len(scans))
@@ -147,10 +150,32 @@ def _track_local_map(
     return ScanMatchingResult(
         trajectory=odometry.trajectory.with_poses(base),
         keyframes=keyframes,
-        keyframe_information=matched + np.linalg.inv(covariance),
+        keyframe_information=matched + inverse(covariance),
         matched_fraction=fraction,
         searched=searched,
         remarks=remarks,
+    )
+
+
+def _chain_scans(
+    scans: BeamScans,
+    odometry: OdometryEstimate,
+    settings: ScanMatchingSettings,
+    executor: Executor,
+    progress: Progress,
+) -> ScanMatchingResult:
+    poses, information, pairs = chain_by_icp(scans, odometry, settings.icp, executor=executor, progress=progress)
+    keyframes = select_keyframes(poses, settings)
+    covariance = covariance_between(poses, inverse(information), keyframes[:-1], keyframes[1:])
+    failed = np.flatnonzero(~pairs.usable)
+    remark = f"{len(failed)} of {len(pairs)} scan pairs could not be registered: odometry took their place"
+    return ScanMatchingResult(
+        trajectory=odometry.trajectory.with_poses(poses),
+        keyframes=keyframes,
+        keyframe_information=inverse(covariance),
+        matched_fraction=np.concatenate([[1.0], pairs.inlier_fraction]),
+        searched=np.zeros(0, dtype=np.int64),
+        remarks=(remark,) if len(failed) else (),
     )
 
 
@@ -161,7 +186,7 @@ def _odometry_alone(odometry: OdometryEstimate, settings: ScanMatchingSettings) 
     return ScanMatchingResult(
         trajectory=odometry.trajectory,
         keyframes=keyframes,
-        keyframe_information=np.linalg.inv(covariance),
+        keyframe_information=inverse(covariance),
         matched_fraction=np.zeros(len(poses)),
         searched=np.zeros(0, dtype=np.int64),
     )

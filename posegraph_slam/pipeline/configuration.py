@@ -11,11 +11,15 @@ from pathlib import Path
 from pydantic import Field
 
 from posegraph_slam.errors import ConfigurationError
+from posegraph_slam.loop_closure.settings import LoopClosureSettings
 from posegraph_slam.mapping.occupancy import OccupancySettings
 from posegraph_slam.mapping.texture import TextureSettings
+from posegraph_slam.odometry.scan_matching import ScanMatchingSettings
 from posegraph_slam.odometry.settings import OdometrySettings
 from posegraph_slam.pipeline.settings_files import Layer, build_settings, parse_override, read_layer
+from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
+from posegraph_slam.registration.beam_scans import BeamScanSettings
 from posegraph_slam.settings import Settings
 
 
@@ -27,7 +31,10 @@ class Configuration(Settings):
     workers: int = Field(0, ge=0, le=1024)
     """Threads or processes that share the work, 0 for one a core; results do not depend on it."""
     odometry: OdometrySettings = OdometrySettings()
-    pose_graph: SolverSettings = SolverSettings()
+    scans: BeamScanSettings = BeamScanSettings()
+    scan_matching: ScanMatchingSettings = ScanMatchingSettings()
+    loop_closure: LoopClosureSettings = LoopClosureSettings()
+    pose_graph: SolverSettings = SolverSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
     mapping: OccupancySettings = OccupancySettings()
     texture: TextureSettings = TextureSettings()
 

@@ -13,11 +13,13 @@ from posegraph_slam.datasets.tum import read_tum
 from posegraph_slam.evaluation.tables import ComparisonTable
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.jit import measure_compile_time
+from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration, usable_workers
 from posegraph_slam.pipeline.executors import open_executor
-from posegraph_slam.pipeline.optimize import OptimizationResult, optimize, save_run
+from posegraph_slam.pipeline.optimize import OptimizationResult, optimize
 from posegraph_slam.pipeline.run_directory import RECORD, RunDirectory, create_run_directory, require_free
-from posegraph_slam.pipeline.run_record import StageClock, run_record
+from posegraph_slam.pipeline.run_record import run_record
+from posegraph_slam.pipeline.saving import save_run
 
 Draw = Callable[[OptimizationResult, RunDirectory], None]
 """Adds pictures to a run directory; given by the caller, since drawing lies above the pipeline."""

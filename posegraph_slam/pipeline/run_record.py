@@ -6,10 +6,7 @@ import hashlib
 import platform
 import resource
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -23,22 +20,6 @@ PACKAGES = ("gtsam", "numpy", "scipy", "numba", "opencv-python-headless", "matpl
 
 HASHED_BYTES = 1 << 28
 """Inputs up to this size are hashed in full (a quarter of a second); larger ones are told by size only."""
-
-
-@dataclass(slots=True)
-class StageClock:
-    """Wall-clock seconds of each stage, in the order in which the stages first ran; a repeated stage adds up."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the duration of the block to the stage `name`."""
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
 
 
 def run_record(

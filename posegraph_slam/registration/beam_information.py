@@ -16,11 +16,16 @@ def information_with_floor(hessian: FloatArray, sigma_m: float, sigma_rad: float
     values, vectors = np.linalg.eigh(hessian)
     scaled = vectors / np.maximum(values, FREE_INFORMATION)[..., None, :]
     covariance = scaled @ np.swapaxes(vectors, -1, -2) + np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
-    information = np.linalg.inv(covariance)
-    return np.asarray(0.5 * (information + np.swapaxes(information, -1, -2)))
+    return inverse(covariance)
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Invert covariances or information matrices (..., p, p), symmetric to the last bit."""
+    result = np.linalg.inv(matrices)
+    return np.asarray(0.5 * (result + np.swapaxes(result, -1, -2)), dtype=np.float64)
 
 
 def information_in_base(information_lidar: FloatArray, T_base_lidar: FloatArray) -> FloatArray:
-    """Move information (..., 3, 3) of a relative lidar pose to that of the base (3, 3) on which the lidar is mounted."""
+    """Move information (..., 3, 3) of a relative lidar pose to that of the base that carries the lidar."""
     adjoint = SE2.adjoint(SE2.inverse(T_base_lidar))
     return np.asarray(adjoint.T @ information_lidar @ adjoint)

@@ -248,34 +248,3 @@ def visibility(source, ref, pose, margin, points, kind, thinned, geometry):  # t
         else:
             agree += 1
     return agree, conflict, hidden
-
-
-@kernel
-def match_many(sources, offsets, refs, ref_poses, starts, priors, settings, points, lines, kind, thinned, geometry):  # type: ignore[no-untyped-def]
-    """Match scan sources[m] to the scans refs[offsets[m]:offsets[m + 1]] for every m; see `match_scan`.
-
-    Returns poses (M, 3), Hessians (M, 3, 3) and statistics (M, 6).
-    """
-    count = len(sources)
-    poses, hessians, stats = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 6))
-    for m in range(count):
-        a, b = offsets[m], offsets[m + 1]
-        poses[m], hessians[m], stats[m] = match_scan(
-            sources[m], refs[a:b], ref_poses[a:b], starts[m], priors[m], settings, points, lines, kind, thinned, geometry
-        )  # fmt: skip
-    return poses, hessians, stats
-
-
-@kernel
-def visibility_many(sources, refs, poses, margin, points, kind, thinned, geometry):  # type: ignore[no-untyped-def]
-    """Visibility counts (M, 6) of sources[m] at poses[m] in the frame of refs[m], and of the reverse."""
-    counts = np.zeros((len(sources), 6), np.int64)
-    for m in range(len(sources)):
-        counts[m, 0], counts[m, 1], counts[m, 2] = visibility(
-            sources[m], refs[m], poses[m], margin, points, kind, thinned, geometry
-        )
-        back = between(poses[m], np.zeros(3))
-        counts[m, 3], counts[m, 4], counts[m, 5] = visibility(
-            refs[m], sources[m], back, margin, points, kind, thinned, geometry
-        )
-    return counts

@@ -27,10 +27,12 @@ def draw_figures(result: OptimizationResult, directory: RunDirectory) -> None:
             rejected=np.asarray(positions[result.rejected_pairs][..., :2]),
         )
     if result.texture is not None:
+        shared = result.texture.geometry is result.occupancy.geometry
         draw_texture(
             result.texture.geometry,
             result.texture.colour,
             result.texture.observed,
             directory.path("figures/texture.png"),
             trajectory=result.trajectory,
+            occupied=result.occupancy.occupied if shared else None,
         )

@@ -1,0 +1,215 @@
+"""The main job: from a log to an optimised trajectory, a pose graph and maps, one stage after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from posegraph_slam.arrays import BoolArray, IntArray
+from posegraph_slam.errors import InputError
+from posegraph_slam.evaluation.summary import compare, evaluate_trajectory
+from posegraph_slam.evaluation.tables import ComparisonTable
+from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
+from posegraph_slam.geometry import SE2, Trajectory, deform
+from posegraph_slam.loop_closure.closing import LoopClosureResult, close_loops
+from posegraph_slam.loop_closure.ledger import LoopRecord
+from posegraph_slam.mapping.crispness import crispness
+from posegraph_slam.mapping.occupancy import OccupancyGrid, build_occupancy
+from posegraph_slam.mapping.texture import TextureMap, build_texture
+from posegraph_slam.odometry.scan_matching import ScanMatchingResult, match_scans
+from posegraph_slam.odometry.scan_odometry import odometry_at_scans
+from posegraph_slam.pipeline.clock import StageClock
+from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
+from posegraph_slam.registration.beam_scans import prepare_beam_scans
+from posegraph_slam.sensors import LaserScans, RobotLog
+
+STAGES = ("odometry", "scan matching", "optimised")
+"""Names of the trajectories that a run compares."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OptimizationResult:
+    """Everything that a run found.
+
+    `stages` maps odometry, scan matching and optimised to their trajectories of all scans (body frame); `keyframes`
+    (K,) are the scans that are nodes of `graph`; `loops` records every candidate that was tried.
+    """
+
+    stages: Mapping[str, Trajectory]
+    keyframes: IntArray
+    graph: PoseGraph
+    loops: tuple[LoopRecord, ...]
+    occupancy: OccupancyGrid
+    texture: TextureMap | None
+    comparison: ComparisonTable
+    metrics: Mapping[str, Any]
+    stages_s: Mapping[str, float]
+    truth: Trajectory | None
+    remarks: tuple[str, ...]
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The optimised trajectory, map -> base, a pose for every scan."""
+        return self.stages["optimised"]
+
+    @property
+    def rejected_pairs(self) -> IntArray:
+        """Target and source keyframe (R, 2) of the candidates that were rejected."""
+        pairs = [(record.target, record.source) for record in self.loops if not record.accepted]
+        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def optimize(
+    log: RobotLog,
+    configuration: Configuration,
+    *,
+    progress: Progress = silent_progress,
+    executor: Executor | None = None,
+) -> OptimizationResult:
+    """Run all stages on a log in memory: odometry, scan matching, loop closure, maps and their comparison.
+
+    The result depends on the log and the configuration alone, not on the number of workers. Raises InputError for a
+    log without usable scans.
+    """
+    executor, clock = executor or SerialExecutor(), StageClock()
+    scans = usable_scans(log)
+    with clock.stage("odometry"):
+        odometry = odometry_at_scans(log, configuration.odometry)
+    with clock.stage("scan matching"):
+        beams = prepare_beam_scans(scans, configuration.scans)
+        matched = match_scans(beams, odometry, configuration.scan_matching, executor=executor, progress=progress)
+    with clock.stage("loop closure"):
+        closed = close_loops(
+            keyframe_chain(matched),
+            beams.select(matched.keyframes),
+            configuration.loop_closure,
+            configuration.pose_graph,
+            executor=executor,
+            progress=progress,
+        )
+        optimised = deform(matched.trajectory, matched.keyframes, closed.graph.poses)
+    stages = dict(zip(STAGES, (odometry.trajectory, matched.trajectory, in_map_frame(optimised)), strict=True))
+    with clock.stage("maps"):
+        maps = {
+            name: build_occupancy(scans, trajectory, configuration.mapping, progress=progress)
+            for name, trajectory in stages.items()
+        }
+        texture = _texture(log, stages["optimised"], maps["optimised"], configuration, executor, progress)
+    with clock.stage("evaluation"):
+        measured = {
+            name: evaluate_trajectory(
+                trajectory, truth=log.truth, relations=log.relations, crispness=crispness(maps[name])
+            )
+            for name, trajectory in stages.items()
+        }
+    return OptimizationResult(
+        stages=stages,
+        keyframes=matched.keyframes,
+        graph=closed.graph,
+        loops=closed.records,
+        occupancy=maps["optimised"],
+        texture=texture,
+        comparison=compare(measured),
+        metrics={
+            "stages": {name: metrics.as_dict() for name, metrics in measured.items()},
+            **_summary(scans, matched, closed),
+        },
+        stages_s=clock.seconds,
+        truth=log.truth,
+        remarks=(*log.remarks, *odometry.remarks, *matched.remarks, *_warnings(closed)),
+    )
+
+
+def usable_scans(log: RobotLog) -> LaserScans:
+    """Return the log's scans; raise InputError where there are too few, or none of them hit anything."""
+    if log.scans is None or len(log.scans) < 2:
+        count = 0 if log.scans is None else len(log.scans)
+        raise InputError(log.path, f"has {count} laser scans", "scan matching needs a log with a LiDAR stream")
+    if not any(log.scans.returns(slice(start, start + 1000)).any() for start in range(0, len(log.scans), 1000)):
+        raise InputError(log.path, "no beam of any scan hit anything", "check range_min, range_max and units (metres)")
+    return log.scans
+
+
+def keyframe_chain(matched: ScanMatchingResult) -> PoseGraph:
+    """Return the graph of the keyframes, each tied to the one before by scan matching; the first is fixed."""
+    poses = matched.trajectory.poses[matched.keyframes]
+    count = len(poses)
+    fixed: BoolArray = np.arange(count) == 0
+    return PoseGraph(
+        poses=poses,
+        session=np.zeros(count, dtype=np.int64),
+        index=matched.keyframes,
+        fixed=fixed,
+        constraints=Constraints(
+            i=np.arange(count - 1),
+            j=np.arange(1, count),
+            T_i_j=SE2.between(poses[:-1], poses[1:]),
+            information=matched.keyframe_information,
+            kind=np.full(count - 1, int(ConstraintKind.SCAN_MATCHING)),
+        ),
+    )
+
+
+def in_map_frame(trajectory: Trajectory) -> Trajectory:
+    """Name the parent frame of an optimised trajectory."""
+    return trajectory.with_poses(trajectory.poses, parent="map")
+
+
+def _texture(
+    log: RobotLog,
+    trajectory: Trajectory,
+    occupancy: OccupancyGrid,
+    configuration: Configuration,
+    executor: Executor,
+    progress: Progress,
+) -> TextureMap | None:
+    """Colour the floor where the log has images."""
+    if log.rgbd is None or not log.rgbd.has_images:
+        return None
+    return build_texture(
+        log.rgbd,
+        trajectory,
+        configuration.texture,
+        geometry=occupancy.geometry,
+        executor=executor,
+        progress=progress,
+    )
+
+
+def _summary(scans: LaserScans, matched: ScanMatchingResult, closed: LoopClosureResult) -> dict[str, Any]:
+    """Counts of the run for `metrics.json`."""
+    accepted = [record for record in closed.records if record.accepted]
+    kinds = sorted({record.kind for record in closed.records})
+    return {
+        "scans": len(scans),
+        "keyframes": len(matched.keyframes),
+        "scans_searched": len(matched.searched),
+        "loops_proposed": len(closed.records),
+        "loops_accepted": len(accepted),
+        "loops_by_kind": {
+            kind: {
+                "proposed": sum(record.kind == kind for record in closed.records),
+                "accepted": sum(record.kind == kind for record in accepted),
+            }
+            for kind in kinds
+        },
+        "loop_rounds": closed.rounds,
+        "graph_cost_initial": closed.solution.cost_initial,
+        "graph_cost": closed.solution.cost,
+        "solver_stop_reason": str(closed.solution.stop_reason),
+    }
+
+
+def _warnings(closed: LoopClosureResult) -> tuple[str, ...]:
+    """Plain sentences on what a user should look at."""
+    remarks = list(closed.solution.notes)
+    if not closed.solution.converged:
+        remarks.append(f"the pose graph did not converge: {closed.solution.stop_reason}")
+    dropped = sum(not record.accepted and np.isfinite(record.sigmas) for record in closed.records)
+    if dropped:
+        remarks.append(f"{dropped} closures disagreed with the rest and were taken out; loops.csv says which")
+    return tuple(remarks)

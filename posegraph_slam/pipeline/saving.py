@@ -1,0 +1,56 @@
+"""Writing what a run found into its directory."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from posegraph_slam.datasets.tum import write_tum
+from posegraph_slam.loop_closure.ledger import LoopRecord
+from posegraph_slam.mapping.archive import write_occupancy
+from posegraph_slam.mapping.images import write_png
+from posegraph_slam.mapping.nav2 import map_pixels, write_nav2
+from posegraph_slam.mapping.texture import texture_pixels
+from posegraph_slam.pipeline.optimize import OptimizationResult
+from posegraph_slam.pipeline.run_directory import LOOPS, METRICS, RunDirectory
+from posegraph_slam.pose_graph.g2o import write_g2o
+
+TRAJECTORY_FILES = {"odometry": "odometry.tum", "scan matching": "scan_matching.tum", "optimised": "trajectory.tum"}
+"""File of each stage's trajectory: a pose of the body at every scan stamp."""
+
+
+def save_run(result: OptimizationResult, directory: RunDirectory) -> None:
+    """Write trajectories, graph, loop candidates, metrics and maps; docs/run_directory.md describes the files."""
+    for stage, name in TRAJECTORY_FILES.items():
+        write_tum(result.stages[stage], directory.path(name))
+    write_g2o(result.graph, directory.path("graph.g2o"))
+    save_loops(result, directory)
+    directory.write_json(METRICS, {"table": result.comparison.as_dict(), **result.metrics})
+    save_maps(result, directory)
+
+
+def save_loops(result: OptimizationResult, directory: RunDirectory) -> None:
+    """Write every loop candidate, named by keyframe, scan and stamp, with its evidence and what became of it."""
+    names = [field.name for field in fields(LoopRecord)]
+    stamps = result.trajectory.stamps_s[result.keyframes]
+    header = ["target_scan", "source_scan", "target_stamp_s", "source_stamp_s", *names]
+    rows = (
+        [
+            result.keyframes[record.target],
+            result.keyframes[record.source],
+            stamps[record.target],
+            stamps[record.source],
+            *(getattr(record, name) for name in names),
+        ]
+        for record in result.loops
+    )
+    directory.write_rows(LOOPS, header, rows)
+
+
+def save_maps(result: OptimizationResult, directory: RunDirectory) -> None:
+    """Write the occupancy map for nav2, for eyes and exactly, and the texture map where there is one."""
+    folder = directory.path("maps/map.pgm").parent
+    write_nav2(result.occupancy, folder)
+    write_png(map_pixels(result.occupancy), folder / "map.png")
+    write_occupancy(result.occupancy, folder / "map.npz")
+    if result.texture is not None:
+        write_png(texture_pixels(result.texture), folder / "texture.png")
