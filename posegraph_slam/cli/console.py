@@ -31,6 +31,11 @@ def print_warning(sentence: str) -> None:
     typer.secho(f"warning: {sentence}", fg=typer.colors.YELLOW, err=True)
 
 
+def print_note(sentence: str) -> None:
+    """Print on stderr what was done and may be of interest."""
+    typer.secho(f"note: {sentence}", dim=True, err=True)
+
+
 class ProgressBars:
     """Receives progress and draws a bar for each stage on stderr; draws nothing where stderr is no terminal."""
 

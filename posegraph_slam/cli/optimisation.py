@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Set, Verbose
-from posegraph_slam.cli.console import ProgressBars, print_json, print_table, print_warning
+from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table
 
 if TYPE_CHECKING:
     from posegraph_slam.pipeline.run import RunSummary
@@ -61,7 +61,7 @@ def default_out(log: Path) -> Path:
 def print_summary(summary: RunSummary, *, verbose: bool) -> None:
     """Print the comparison of the stages, then where the results lie; remarks go to stderr."""
     for remark in summary.remarks:
-        print_warning(remark)
+        print_note(remark)
     print_table(summary.table.as_text_rows())
     if verbose:
         seconds = summary.record["stages_s"]

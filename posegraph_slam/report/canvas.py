@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import matplotlib.style
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import ScaledTranslation
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.files import replacing
@@ -48,7 +50,7 @@ def page(path: Path, bounds_m: tuple[float, float, float, float], *, title: str 
         axes.set_ylabel("y [m]")
         axes.set_title(title)
         yield axes
-        add_scale_bar(axes)
+        add_scale_bar(figure, axes)
         handles, labels = axes.get_legend_handles_labels()
         if handles:
             columns = min(len(handles), max(2, int(size[0] / 1.9)))
@@ -57,25 +59,21 @@ def page(path: Path, bounds_m: tuple[float, float, float, float], *, title: str 
             figure.savefig(temporary, format="png", bbox_inches="tight", metadata={"Software": None})
 
 
-def add_scale_bar(axes: Axes) -> None:
-    """Draw a bar of a round length, about a fifth of the width, in the lower right corner."""
+def add_scale_bar(figure: Figure, axes: Axes) -> None:
+    """Draw a bar of a round length, about a fifth of the width, below the lower right corner of the axes."""
     left, right = axes.get_xlim()
-    bottom, top = axes.get_ylim()
     length = round_length((right - left) / 5)
-    x1, y = right - 0.04 * (right - left), bottom + 0.04 * (top - bottom)
-    axes.add_line(Line2D([x1 - length, x1], [y, y], color="white", linewidth=7, alpha=0.8, zorder=9))
-    bar = Line2D([x1 - length, x1], [y, y], color=BLACK, linewidth=3, solid_capstyle="butt", zorder=10)
-    axes.add_line(bar)
-    axes.annotate(
-        f"{length:g} m",
-        (x1 - length / 2, y),
-        xytext=(0, 5),
-        textcoords="offset points",
-        ha="center",
-        fontsize=9,
-        zorder=10,
-        bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1},
-    )
+    below = ScaledTranslation(0, -0.36, figure.dpi_scale_trans)
+    place = axes.get_xaxis_transform() + below
+    bar: dict[str, Any] = {
+        "color": BLACK,
+        "linewidth": 3,
+        "solid_capstyle": "butt",
+        "clip_on": False,
+        "transform": place,
+    }
+    axes.add_line(Line2D([right - length, right], [0, 0], **bar))
+    axes.text(right - length * 1.05, 0, f"{length:g} m", ha="right", va="center", fontsize=9, transform=place)
 
 
 def round_length(length_m: float) -> float:

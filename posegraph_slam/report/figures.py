@@ -139,7 +139,7 @@ def draw_segments(axes: Axes, segments: FloatArray, kind: ConstraintKind) -> Non
         return
     along = kind is ConstraintKind.FIXED_INTERVAL
     label = f"{kind.name.lower().replace('_', ' ')} loops ({len(segments)})"
-    width, height = (4.0, 2.0) if along else (1.1, 4.0)
+    width, height = (3.0, 2.0) if along else (1.1, 4.0)
     lines = LineCollection(list(segments), colors=KIND_COLOURS[kind], linewidths=width, label=label, zorder=height)
     axes.add_collection(lines)
     if not along:
@@ -171,7 +171,7 @@ def draw_texture(
     walls = np.zeros_like(covered) if occupied is None else occupied
     picture = np.full((*covered.shape, 3), int(UNKNOWN_GREY * 255), dtype=np.uint8)
     picture[covered] = colours[covered]
-    picture[walls & ~covered] = 60
+    picture[walls] = 60
     view = View.of(geometry, covered | walls)
     with page(path, view.extent_m, title=title) as axes:
         axes.imshow(view.samples(picture), origin="lower", extent=view.extent_m, **PIXELS)

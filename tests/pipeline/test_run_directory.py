@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from posegraph_slam.errors import InputError
+from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration, configuration_hash
 from posegraph_slam.pipeline.run_directory import create_run_directory, plain, read_run_directory, require_free
-from posegraph_slam.pipeline.run_record import StageClock, fingerprint, peak_memory_mib, run_record
+from posegraph_slam.pipeline.run_record import fingerprint, peak_memory_mib, run_record
 
 
 def write_run(path: Path, *, overwrite: bool = False, seed: int = 3, mark: str = "") -> None:
