@@ -58,6 +58,7 @@ class VerificationSettings(Settings):
     support_min: int = Field(default=1, ge=0)
     """Other candidates nearby that must agree with one that was found in a window wider than `trusted_drift_m`."""
     trusted_drift_m: float = Field(default=0.5, gt=0)
+    """Candidates found in a window no wider than this need no support."""
     consistency_m: float = Field(default=0.3, gt=0)
     """Two candidates agree when the loop through both closes this well,"""
     consistency_rad: float = Field(default=0.06, gt=0)
@@ -78,5 +79,6 @@ class LoopClosureSettings(Settings):
     """Loop closure as a whole."""
 
     enabled: bool = True
+    """Whether loops are closed at all."""
     proposals: ProposalSettings = ProposalSettings()
     verification: VerificationSettings = VerificationSettings()

@@ -36,13 +36,17 @@ class ScanMatchingSettings(Settings):
     matched_fraction_min: float = Field(default=0.3, ge=0, le=1)
     """When less of a scan matches, a window around the prediction is searched."""
     search_reach_m: float = Field(default=1.0, gt=0)
+    """Half the side of that window,"""
     search_reach_rad: float = Field(default=1.6, gt=0)
+    """and the largest turn in it."""
     prediction_sigma_m: float = Field(default=0.01, gt=0)
     """Added to the odometry's own sigma of a step, because its errors are systematic rather than random."""
     prediction_sigma_rad: float = Field(default=0.01, gt=0)
+    """The same for its heading."""
     covariance_floor_m: float = Field(default=0.01, gt=0)
     """The motion between keyframes is not known better than this, whatever the number of points says."""
     covariance_floor_rad: float = Field(default=0.003, gt=0)
+    """The same for the turn between keyframes."""
     match: BeamMatchSettings = BeamMatchSettings()
     """Matching of a scan to the local map."""
     icp: IcpSettings = IcpSettings()

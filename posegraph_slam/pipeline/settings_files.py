@@ -205,22 +205,27 @@ def _type_words(annotation: Any) -> str:
 def to_toml(settings: Settings) -> str:
     """Write every key of `settings` as TOML, each under a comment that describes it and names its range."""
     lines: list[str] = []
-    _write_section(settings, "", lines)
+    _write_section(settings, "", _title(type(settings)), lines)
     return "\n".join(lines).strip() + "\n"
 
 
-def _write_section(settings: Settings, name: str, lines: list[str]) -> None:
+def _write_section(settings: Settings, name: str, title: str, lines: list[str]) -> None:
     fields = type(settings).model_fields
     values = {key: info for key, info in fields.items() if _section(info) is None}
-    title = _comment((type(settings).__doc__ or "").strip().split("\n")[0])
     if values or not fields:
-        lines += ["", *title, f"[{name}]"] if name else [*title, ""]
+        lines += ["", *_comment(title), f"[{name}]"] if name else [*_comment(title), ""]
     for key, info in values.items():
-        description = (info.description or "").strip().split("\n\n")[0].replace("\n", " ")
+        description = (info.description or "").strip().split("\n\n")[0]
         lines += [*_comment(f"{description} [{allowed(info)}]"), f"{key} = {_toml(getattr(settings, key))}"]
     for key, info in fields.items():
-        if _section(info) is not None:
-            _write_section(getattr(settings, key), f"{name}.{key}".lstrip("."), lines)
+        section = _section(info)
+        if section is not None:
+            title = info.description or _title(section)
+            _write_section(getattr(settings, key), f"{name}.{key}".lstrip("."), title, lines)
+
+
+def _title(model: type[Settings]) -> str:
+    return (model.__doc__ or "").strip().split("\n")[0]
 
 
 def _comment(text: str, width: int = 110) -> list[str]:

@@ -31,8 +31,11 @@ class BeamMatchSettings(Settings):
     normal_angle_max_rad: float = Field(default=1.05, gt=0, lt=3.2)
     """Surfaces that face further apart than this are not the same."""
     iterations_max: int = Field(default=12, ge=4)
+    """Steps after which the matching stops."""
     rotation_tolerance_rad: float = Field(default=1e-4, gt=0)
+    """A step that turns less, and moves less than `translation_tolerance_m`, ends the matching."""
     translation_tolerance_m: float = Field(default=1e-3, gt=0)
+    """A step that moves less, and turns less than `rotation_tolerance_rad`, ends the matching."""
 
     def vector(self) -> FloatArray:
         """Return the values in the order that `match_scan` expects."""

@@ -83,6 +83,7 @@ class Root(Settings):
     """The seed."""
     mapping: Section = Section()
     coarse: Section = Section(resolution_m=0.5, name="coarse")
+    """The same, coarser."""
 
 
 def build(*overrides: str) -> Root:
@@ -195,6 +196,8 @@ def test_toml_reads_back_as_the_same_settings(resolution, depth, name, size, off
 def test_toml_describes_each_key() -> None:
     text = to_toml(Root())
     assert "# Side of a cell. [a number > 0]\nresolution_m = 0.05\n" in text
+    assert "# The same, coarser.\n[coarse]\n" in text
+    assert "# A section.\n[mapping]\n" in text
     assert "# Deep keys.\n[mapping.inner]\n# How deep. [an integer >= 1 and <= 9]\ndepth = 3\n" in text
 
 
