@@ -180,7 +180,8 @@ def allowed(info: FieldInfo) -> str:
     bounds = []
     for attribute, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="), ("multiple_of", "a multiple of")):
         bounds += [f"{sign} {getattr(rule, attribute):g}" for rule in info.metadata if hasattr(rule, attribute)]
-    return _type_words(info.annotation) + (" " + " and ".join(bounds) if bounds else "")
+    words = _type_words(info.annotation) + (" " + " and ".join(bounds) if bounds else "")
+    return f"{words}, or {json.dumps(UNSET)}" if _is_optional(info) else words
 
 
 def _type_words(annotation: Any) -> str:
@@ -191,8 +192,7 @@ def _type_words(annotation: Any) -> str:
     if origin is typing.Literal:
         return "one of " + ", ".join(json.dumps(choice) for choice in arguments)
     if origin in (typing.Union, types.UnionType):
-        named = [_type_words(argument) for argument in arguments if argument is not type(None)]
-        return " or ".join([*named, json.dumps(UNSET)] if type(None) in arguments else named)
+        return " or ".join(_type_words(argument) for argument in arguments if argument is not type(None))
     if origin in (tuple, list):
         counted = "" if Ellipsis in arguments or origin is list else f"{len(arguments)} "
         return f"a list of {counted}values, each {_type_words(arguments[0])}"
@@ -216,7 +216,7 @@ def _write_section(settings: Settings, name: str, title: str, lines: list[str]) 
         lines += ["", *_comment(title), f"[{name}]"] if name else [*_comment(title), ""]
     for key, info in values.items():
         description = (info.description or "").strip().split("\n\n")[0]
-        lines += [*_comment(f"{description} [{allowed(info)}]"), f"{key} = {_toml(getattr(settings, key))}"]
+        lines += [*_comment(description, allowed(info)), f"{key} = {_toml(getattr(settings, key))}"]
     for key, info in fields.items():
         section = _section(info)
         if section is not None:
@@ -228,10 +228,11 @@ def _title(model: type[Settings]) -> str:
     return (model.__doc__ or "").strip().split("\n")[0]
 
 
-def _comment(text: str, width: int = 110) -> list[str]:
+def _comment(text: str, bracket: str = "", width: int = 110) -> list[str]:
+    """Break text into comment lines, with what is in brackets unbroken at the end."""
     lines, line = [], "#"
-    for word in text.split():
-        if len(line) + 1 + len(word) > width:
+    for word in [*text.split(), *([f"[{bracket}]"] if bracket else [])]:
+        if len(line) + 1 + len(word) > width and line != "#":
             lines.append(line)
             line = "#"
         line += f" {word}"

@@ -138,7 +138,7 @@ def test_one_key_of_a_section_leaves_its_other_defaults() -> None:
         ("mapping.enabled=1", "it must be true or false"),
         ("mapping.loss=l2", 'it must be one of "huber", "cauchy"'),
         ("mapping.mode=c", 'it must be one of "a", "b"'),
-        ("mapping.size_m=-1", 'it must be a number or "none" > 0'),
+        ("mapping.size_m=-1", 'it must be a number > 0, or "none"'),
         ("mapping.offset=[1]", "'mapping.offset'"),
         ("mapping.name=3", "it must be a string"),
         ("mapping=3", "'mapping' is a section, not a value; its keys are mapping.resolution_m"),
