@@ -11,6 +11,8 @@ from posegraph_slam.arrays import ByteArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.mapping.archive import replace_file
 
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
 
 def write_png(pixels: ByteArray, path: Path) -> None:
     """Write (R, C) grey, (R, C, 3) RGB or (R, C, 4) RGBA pixels, top row first, as a PNG."""
@@ -28,7 +30,9 @@ def read_image(path: Path) -> ByteArray:
         content = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise InputError(path, f"cannot be opened ({error.strerror})") from error
-    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    # Some releases of OpenCV fill up a truncated PNG in silence: its last chunk tells.
+    whole = content[:8].tobytes() != PNG_SIGNATURE or b"IEND" in content[-64:].tobytes()
+    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) and whole else None
     if pixels is None:
         raise InputError(path, "is not an image that can be decoded", "the file may be truncated or of another type")
     if pixels.ndim == 3:
