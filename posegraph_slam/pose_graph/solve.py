@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -44,17 +45,17 @@ def solve(
     cost_initial = graph_cost(graph, settings.robust)
     best = run_gtsam(graph, settings, progress)
     best_cost, notes = graph_cost(graph.with_poses(best.poses), settings.robust), []
-    stuck = not _is_optimum(graph, best, settings)
-    for note, start, variant in _attempts(graph, settings) if stuck and settings.retry else ():
-        notes.append(note)
-        warm = graph if start is None else graph.with_poses(run_gtsam(start, settings, progress).poses)
-        run = run_gtsam(_cheaper(graph, warm, best.poses, settings), variant, progress)
+    optimal = _is_optimum(graph, best, settings)
+    for attempt in _attempts(graph, settings, best.stop_reason) if settings.retry and not optimal else ():
+        run = _try(graph, best.poses, attempt, settings, progress)
+        notes.append(attempt.note)
         cost = graph_cost(graph.with_poses(run.poses), settings.robust)
         if cost < best_cost:
             best, best_cost = run, cost
-        if not (stuck := not _is_optimum(graph, best, settings)):
+            optimal = _is_optimum(graph, best, settings)
+        if optimal:
             break
-    return _result(graph, settings, cost_initial, best, stuck, tuple(notes))
+    return _result(graph, settings, cost_initial, best, optimal, tuple(notes))
 
 
 def constraint_costs(graph: PoseGraph, squared: FloatArray, robust: RobustSettings) -> FloatArray:
@@ -105,33 +106,49 @@ def clamp_information(constraints: Constraints, largest: float) -> Constraints:
     )
 
 
-def _is_optimum(graph: PoseGraph, run: OptimizerRun, settings: SolverSettings) -> bool:
-    if run.stop_reason is StopReason.MAX_ITERATIONS:
-        return True
-    solved = graph.with_poses(run.poses)
-    saved = possible_decrease(solved, settings.robust)
-    return saved <= OPTIMALITY_TOLERANCE * graph_cost(solved, settings.robust) + OPTIMALITY_FLOOR
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Attempt:
+    """Something to try after a stall: a graph to solve first for a start, if any, and how to solve from there."""
+
+    note: str
+    settings: SolverSettings
+    easier: PoseGraph | None = None
+    orthogonal: bool = False
 
 
-def _attempts(graph: PoseGraph, settings: SolverSettings) -> Iterator[tuple[str, PoseGraph | None, SolverSettings]]:
-    """What to try after a stall: (what it is, graph to solve first for a start or None, settings)."""
+def _attempts(graph: PoseGraph, settings: SolverSettings, reason: StopReason) -> Iterator[_Attempt]:
+    """Yield what to try: the other ordering, then starts with clamped information, then QR instead of Cholesky."""
     damped = settings.model_copy(update={"method": SolverMethod.LEVENBERG_MARQUARDT})
     metis, colamd = EliminationOrdering.METIS, EliminationOrdering.COLAMD
     other = colamd if chosen_ordering(graph, settings.ordering) is metis else metis
-    yield f"stalled: tried {other} ordering", None, damped.model_copy(update={"ordering": other})
+    if reason is not StopReason.MAX_ITERATIONS:
+        yield _Attempt(note=f"tried {other} ordering", settings=damped.model_copy(update={"ordering": other}))
     largest = np.linalg.eigvalsh(graph.constraints.information)[:, -1]
-    for factor in CLAMPS:
-        cap = factor * float(np.median(largest))
-        if np.any(largest > cap):
-            clamped = graph.with_constraints(clamp_information(graph.constraints, cap))
-            yield f"stalled: tried a start with information clamped at {cap:.3g}", clamped, damped
+    caps = [factor * float(np.median(largest)) for factor in CLAMPS]
+    for cap in (cap for cap in caps if np.any(largest > cap)):
+        clamped = graph.with_constraints(clamp_information(graph.constraints, cap))
+        note = f"tried a start with information clamped at {cap:.3g}"
+        yield _Attempt(note=note, settings=damped, easier=clamped)
+    if np.any(largest > caps[-1]):
+        yield _Attempt(note="tried QR elimination", settings=damped, orthogonal=True)
 
 
-def _cheaper(graph: PoseGraph, warm: PoseGraph, poses: FloatArray, settings: SolverSettings) -> PoseGraph:
-    """Return the graph at the cheaper of two sets of poses."""
-    warm = graph.with_poses(warm.poses)
-    best = graph.with_poses(poses)
-    return warm if graph_cost(warm, settings.robust) < graph_cost(best, settings.robust) else best
+def _try(
+    graph: PoseGraph, best: FloatArray, attempt: _Attempt, settings: SolverSettings, progress: Progress
+) -> OptimizerRun:
+    """Solve from the best poses so far, or from those of the easier graph if they cost less."""
+    start = graph.with_poses(best)
+    if attempt.easier is not None:
+        warm = graph.with_poses(run_gtsam(attempt.easier.with_poses(best), attempt.settings, progress).poses)
+        if graph_cost(warm, settings.robust) < graph_cost(start, settings.robust):
+            start = warm
+    return run_gtsam(start, attempt.settings, progress, orthogonal=attempt.orthogonal)
+
+
+def _is_optimum(graph: PoseGraph, run: OptimizerRun, settings: SolverSettings) -> bool:
+    solved = graph.with_poses(run.poses)
+    saved = possible_decrease(solved, settings.robust)
+    return saved <= OPTIMALITY_TOLERANCE * graph_cost(solved, settings.robust) + OPTIMALITY_FLOOR
 
 
 def _result(
@@ -139,20 +156,18 @@ def _result(
     settings: SolverSettings,
     cost_initial: float,
     run: OptimizerRun,
-    stuck: bool,
+    optimal: bool,
     notes: tuple[str, ...],
 ) -> SolveResult:
     poses = np.where(graph.fixed[:, None, None], graph.poses, run.poses)
     squared = chi2(graph.with_poses(poses))
     cost = float(np.sum(constraint_costs(graph, squared, settings.robust)))
     reason = run.stop_reason
-    if cost > cost_initial * (1 + 1e-12) or not np.isfinite(cost):
-        poses, squared, cost = graph.poses, chi2(graph), cost_initial
-    if stuck:
-        reason = StopReason.DIVERGED if reason is StopReason.DIVERGED else StopReason.STALLED
-    elif reason is not StopReason.MAX_ITERATIONS:
+    if optimal and reason is not StopReason.MAX_ITERATIONS:
         unchanged = cost_initial - cost <= settings.relative_tolerance * cost_initial + settings.absolute_tolerance
         reason = StopReason.ALREADY_OPTIMAL if unchanged else StopReason.CONVERGED
+    elif not optimal and reason is StopReason.CONVERGED:
+        reason = StopReason.STALLED
     return SolveResult(
         poses=poses,
         cost_initial=cost_initial,
