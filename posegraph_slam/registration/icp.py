@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray
@@ -13,7 +15,7 @@ from posegraph_slam.registration.residuals import Residual, linearise, residual_
 from posegraph_slam.registration.result import RegistrationResult, RegistrationStatus
 from posegraph_slam.registration.robust import influence_slopes, residual_scale, robust_weights
 from posegraph_slam.registration.settings import IcpSettings, Loss
-from posegraph_slam.registration.uncertainty import Evidence, information_of, rotation_part
+from posegraph_slam.registration.uncertainty import Evidence, information_of
 
 DEFAULT_SETTINGS = IcpSettings()
 
@@ -59,11 +61,11 @@ def icp(
 
 def has_settled(T_before: FloatArray, T_after: FloatArray, settings: IcpSettings) -> bool:
     """Whether a step turned and moved less than the tolerances."""
-    group = SE2 if T_before.shape[0] == 3 else SE3
-    step = group.local(T_before, T_after)
-    turn = rotation_part(group.dimension)
-    turned = float(np.linalg.norm(step[turn]))
-    moved = float(np.linalg.norm(np.delete(step, turn)))
+    d = T_before.shape[0] - 1
+    # a turn by w takes the rotation 2 sqrt(2) sin(w / 2) away in the Frobenius norm, in the plane and in space
+    apart = float(np.linalg.norm(T_after[:d, :d] - T_before[:d, :d]))
+    turned = 2.0 * math.asin(min(apart / math.sqrt(8.0), 1.0))
+    moved = float(np.linalg.norm(T_after[:d, d] - T_before[:d, d]))
     return turned < settings.rotation_tolerance_rad and moved < settings.translation_tolerance_m
 
 

@@ -20,38 +20,22 @@ class Frame:
     A tangent d at the source origin and e in this frame are the same motion if d = `to_origin` e; `to_origin` (p, p).
     """
 
-    centre: FloatArray
-    radius_m: float
     to_origin: FloatArray
 
 
-def balanced_frame(points: FloatArray) -> Frame:
-    """Centre a tangent frame on source points (m, d); one unit of turn moves their root mean square radius by 1 m."""
-    d = points.shape[1]
-    group = SE2 if d == 2 else SE3
-    centre = points.mean(axis=0)
-    radius = max(float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)))), 1e-9)
-    shift = group.identity()
+def balanced_frame(centre: FloatArray, radius_m: float) -> Frame:
+    """Make the tangent frame about `centre` (d,) in which one unit of turn moves points at `radius_m` by 1 m."""
+    d = len(centre)
+    shift = np.eye(d + 1)
     shift[:d, d] = centre
-    unit = np.ones(group.dof)
-    unit[rotation_part(d)] = 1.0 / radius
-    return Frame(centre=centre, radius_m=radius, to_origin=group.adjoint(shift) * unit)
+    unit = np.ones(3 * (d - 1))
+    unit[rotation_part(d)] = 1.0 / radius_m
+    return Frame(to_origin=(SE2 if d == 2 else SE3).adjoint(shift) * unit)
 
 
 def rotation_part(dimension: int) -> slice:
     """Where the rotation stands in a tangent: last in SE(2), first in SE(3)."""
     return slice(2, 3) if dimension == 2 else slice(0, 3)
-
-
-def plane_jacobian(points: FloatArray, normals: FloatArray, frame: Frame) -> FloatArray:
-    """Derivative (m, p) of n . (R p + t - q) by the right update in `frame`; normals (m, d) in the source frame.
-
-    With arm a = (p - centre) / radius: dr/dv = n, dr/dw = a x n (Chen and Medioni 1992 in the source frame).
-    """
-    arm = (points - frame.centre) / frame.radius_m
-    if points.shape[1] == 2:
-        return np.column_stack([normals, arm[:, 0] * normals[:, 1] - arm[:, 1] * normals[:, 0]])
-    return np.concatenate([np.cross(arm, normals), normals], axis=1)
 
 
 def split_directions(hessian: FloatArray, ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
