@@ -64,13 +64,11 @@ def print_summary(summary: RunSummary, *, verbose: bool) -> None:
         print_note(remark)
     print_table(summary.table.as_text_rows())
     if verbose:
-        seconds = summary.record["stages_s"]
-        width = max(map(len, seconds), default=0)
+        record = summary.record
         typer.echo("")
-        for name, value in seconds.items():
-            typer.echo(f"{name:<{width}}  {value:8.2f} s")
+        print_table([["stage", "time [s]"], *([name, f"{value:.2f}"] for name, value in record["stages_s"].items())])
         typer.echo(
-            f"compiling {summary.record['jit_compile_s']:.1f} s, peak {summary.record['peak_memory_mib']:.0f} MiB"
+            f"of this compiling {record['jit_compile_s']:.1f} s; peak memory {record['peak_memory_mib']:.0f} MiB"
         )
     typer.echo(f"\nresults:  {summary.folder}")
     for picture in sorted(summary.folder.glob("figures/*.png")):
