@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -131,7 +132,7 @@ def draw_map(
 
 
 def draw_segments(axes: Axes, segments: FloatArray, kind: ConstraintKind) -> None:
-    """Draw edges (E, 2 ends, 2) as lines with a dot at both ends, so that even the shortest are seen.
+    """Draw edges (E, 2 ends, 2) as lines with a dot at both ends, so that even the shortest are seen; thinner where there are many.
 
     Edges of a fixed interval follow the trajectory: they are a broad band under it, the others lie over it.
     """
@@ -139,12 +140,13 @@ def draw_segments(axes: Axes, segments: FloatArray, kind: ConstraintKind) -> Non
         return
     along = kind is ConstraintKind.FIXED_INTERVAL
     label = f"{kind.name.lower().replace('_', ' ')} loops ({len(segments)})"
-    width, height = (3.0, 2.0) if along else (1.1, 4.0)
+    crowding = math.sqrt(150 / max(len(segments), 150))
+    width, height = (3.0, 2.0) if along else (1.1 * crowding, 4.0)
     lines = LineCollection(list(segments), colors=KIND_COLOURS[kind], linewidths=width, label=label, zorder=height)
     axes.add_collection(lines)
     if not along:
         ends = segments.reshape(-1, 2)
-        axes.scatter(ends[:, 0], ends[:, 1], s=5, color=KIND_COLOURS[kind], linewidths=0, zorder=5)
+        axes.scatter(ends[:, 0], ends[:, 1], s=5 * crowding, color=KIND_COLOURS[kind], linewidths=0, zorder=5)
 
 
 def loop_segments(positions: FloatArray, constraints: Constraints) -> dict[ConstraintKind, FloatArray]:
