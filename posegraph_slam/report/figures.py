@@ -132,8 +132,9 @@ def draw_map(
 
 
 def draw_segments(axes: Axes, segments: FloatArray, kind: ConstraintKind) -> None:
-    """Draw edges (E, 2 ends, 2) as lines with a dot at both ends, so that even the shortest are seen; thinner where there are many.
+    """Draw edges (E, 2 ends, 2) as lines with a dot at both ends, so that even the shortest are seen.
 
+    Many edges are drawn thinner, so that the map stays visible.
     Edges of a fixed interval follow the trajectory: they are a broad band under it, the others lie over it.
     """
     if len(segments) == 0:

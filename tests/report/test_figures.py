@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib.image
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
 from posegraph_slam.mapping.grid import GridGeometry
@@ -41,8 +41,9 @@ def grid() -> OccupancyGrid:
 
 def share(path: Path, colour: str, tolerance: int = 12) -> float:
     """Part of the pixels that have about this colour."""
-    pixels = (matplotlib.image.imread(path)[..., :3] * 255).round().astype(int)
-    wanted = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
+    with Image.open(path) as picture:
+        pixels = np.asarray(picture.convert("RGB"), np.int16)
+    wanted = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.int16)
     return float((np.abs(pixels - wanted).max(axis=-1) <= tolerance).mean())
 
 
