@@ -10,7 +10,7 @@ from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
-from posegraph_slam.registration.pairing import Pairs, Scene, pair_points, place, rejections_for
+from posegraph_slam.registration.pairing import Pairs, Scene, association_for, pair_points, place, rejections_for
 from posegraph_slam.registration.residuals import Residual, linearise, residual_for
 from posegraph_slam.registration.result import RegistrationResult, RegistrationStatus
 from posegraph_slam.registration.robust import influence_slopes, residual_scale, robust_weights
@@ -40,11 +40,15 @@ def icp(
         return failed(RegistrationStatus.TOO_FEW_POINTS, source.dimension)
     if not (source.spans_plane and target.spans_plane):
         return failed(RegistrationStatus.DEGENERATE, source.dimension)
-    residual, rejections = residual_for(settings), rejections_for(settings)
+    residual, associate, rejections = (
+        residual_for(settings),
+        association_for(target, settings),
+        rejections_for(settings),
+    )
     status, iteration = RegistrationStatus.MAX_ITERATIONS, 0
     for iteration in range(1, settings.max_iterations + 1):
         scene = place(source, target, T)
-        pairs = pair_points(scene, settings, rejections)
+        pairs = pair_points(scene, associate, rejections)
         if len(pairs) < max(settings.min_inliers, settings.min_inlier_fraction * len(source)):
             return failed(RegistrationStatus.TOO_FEW_INLIERS, source.dimension, pairs=len(pairs), iterations=iteration)
         better = residual.improve(scene, pairs, _weights(residual, scene, pairs, settings)[0])

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.geometry import transform_points
 from posegraph_slam.registration.cloud import Cloud
-from posegraph_slam.registration.settings import IcpSettings, ResidualKind
+from posegraph_slam.registration.settings import AssociationKind, IcpSettings, ResidualKind
+from posegraph_slam.registration.voxel_hash import build_voxel_hash, search_voxel_hash
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,26 +41,53 @@ class Scene:
     moved: FloatArray
 
 
+Association = Callable[[FloatArray], Pairs]
+"""Pairs moved source points (n, d) with target points."""
+
 Rejection = Callable[[Scene, Pairs], BoolArray]
 """Tells which pairs (m,) stay."""
 
 
-def pair_points(scene: Scene, settings: IcpSettings, rejections: tuple[Rejection, ...]) -> Pairs:
-    """Pair every source point with its nearest target point within the gate, then apply the rejections in order."""
-    pairs = nearest_pairs(scene, settings.max_distance_m)
+def pair_points(scene: Scene, associate: Association, rejections: tuple[Rejection, ...]) -> Pairs:
+    """Pair source points with their nearest target points, then apply the rejections in order."""
+    pairs = associate(scene.moved)
     for rejection in rejections:
         pairs = pairs.select(rejection(scene, pairs))
     return pairs
 
 
-def nearest_pairs(scene: Scene, max_distance_m: float) -> Pairs:
-    """Pair source points with their nearest target points no farther than `max_distance_m` by the KD-tree."""
+def association_for(target: Cloud, settings: IcpSettings) -> Association:
+    """Return the search for target points no farther than the gate that `settings` names."""
+    kind = settings.association
+    if kind is None:
+        kind = AssociationKind.VOXEL_HASH if target.dimension == 2 else AssociationKind.KD_TREE
+    by_kind = {AssociationKind.VOXEL_HASH: by_voxel_hash, AssociationKind.KD_TREE: by_tree}
+    return by_kind[kind](target, settings.max_distance_m)
+
+
+def by_tree(target: Cloud, max_distance_m: float) -> Association:
+    """Search by the cloud's KD-tree."""
     # the search excludes its own bound; one float up lets a pair at exactly the gate in
-    distance, target = scene.target.tree.query(
-        scene.moved, distance_upper_bound=np.nextafter(max_distance_m, np.inf), workers=1
-    )
-    source = np.flatnonzero(np.isfinite(distance))
-    return Pairs(source=source, target=np.asarray(target)[source], distance_m=np.asarray(distance)[source])
+    bound = np.nextafter(max_distance_m, np.inf)
+
+    def associate(moved: FloatArray) -> Pairs:
+        distance, row = (np.asarray(a) for a in target.tree.query(moved, distance_upper_bound=bound, workers=1))
+        source = np.flatnonzero(np.isfinite(distance))
+        return Pairs(source=source, target=row[source], distance_m=distance[source])
+
+    return associate
+
+
+def by_voxel_hash(target: Cloud, max_distance_m: float) -> Association:
+    """Search by voxels hashed for this gate."""
+    voxels = build_voxel_hash(target.points, max_distance_m)
+
+    def associate(moved: FloatArray) -> Pairs:
+        row, distance = search_voxel_hash(voxels, moved)
+        source = np.flatnonzero(row >= 0)
+        return Pairs(source=source, target=row[source], distance_m=distance[source])
+
+    return associate
 
 
 def rejections_for(settings: IcpSettings) -> tuple[Rejection, ...]:

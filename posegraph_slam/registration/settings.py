@@ -19,6 +19,13 @@ class ResidualKind(StrEnum):
     """Distance to the target's tangent plane, in 2D its tangent line; solved by Gauss-Newton."""
 
 
+class AssociationKind(StrEnum):
+    """How the nearest target point is searched; the pairs are the same, ties apart."""
+
+    KD_TREE = "kd_tree"
+    VOXEL_HASH = "voxel_hash"
+
+
 class Loss(StrEnum):
     """Robust loss that weighs residuals down as they grow."""
 
@@ -34,6 +41,8 @@ class IcpSettings(Settings):
 
     residual: ResidualKind = ResidualKind.POINT_TO_PLANE
     """What is minimised; point_to_plane means point-to-line in 2D."""
+    association: AssociationKind | None = None
+    """How neighbours are searched; none takes the faster: voxel_hash in the plane, kd_tree in space."""
     max_distance_m: float = Field(default=0.5, gt=0)
     """Pairs farther apart are dropped."""
     keep_fraction: float = Field(default=1.0, gt=0, le=1)
@@ -67,8 +76,19 @@ class IcpSettings(Settings):
 
     @classmethod
     def point_to_point(cls) -> IcpSettings:
-        """Plain trimmed Kabsch ICP as in the course report's scan matching: unweighted, in closed form."""
-        return cls(residual=ResidualKind.POINT_TO_POINT, loss=Loss.NONE, keep_fraction=0.9, max_iterations=100)
+        """Plain trimmed Kabsch ICP as in the course report's scan matching: unweighted, in closed form.
+
+        It creeps along walls: tolerances of 0.1 mm and 0.1 mrad take 31 rounds a pair of 1081 beams, a tenth of
+        them 43 for an error 0.7 mm smaller.
+        """
+        return cls(
+            residual=ResidualKind.POINT_TO_POINT,
+            loss=Loss.NONE,
+            keep_fraction=0.9,
+            max_iterations=100,
+            rotation_tolerance_rad=1e-4,
+            translation_tolerance_m=1e-4,
+        )
 
     @classmethod
     def point_to_line(cls) -> IcpSettings:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3, Group, align_points
-from posegraph_slam.registration.cloud import neighbourhood_moments, prepare_cloud
+from posegraph_slam.registration.cloud import Cloud, neighbourhood_moments, prepare_cloud
 from posegraph_slam.registration.icp import has_settled
 from posegraph_slam.registration.pairing import (
+    Association,
     Pairs,
+    by_tree,
+    by_voxel_hash,
     is_reciprocal,
-    nearest_pairs,
     normal_angle_test,
     place,
     trimming_test,
@@ -19,6 +26,7 @@ from posegraph_slam.registration.pairing import (
 from posegraph_slam.registration.residuals import PointToPlane, PointToPoint, linearise, plane_residuals
 from posegraph_slam.registration.settings import IcpSettings
 
+searches = pytest.mark.parametrize("search", [by_tree, by_voxel_hash])
 spaces = pytest.mark.parametrize("group", [SE2, SE3], ids=["2d", "3d"])
 
 
@@ -60,26 +68,31 @@ def test_corners_are_trusted_less_than_walls() -> None:
 
 
 @spaces
-def test_association_is_that_of_brute_force(group: Group) -> None:
+@searches
+@pytest.mark.parametrize("gate_m", [0.05, 0.6, 5.0])
+def test_association_is_that_of_brute_force(
+    group: Group, search: Callable[[Cloud, float], Association], gate_m: float
+) -> None:
     rng = np.random.default_rng(1)
     source, target = rng.normal(size=(80, group.dimension)), rng.normal(size=(50, group.dimension))
+    source[:10] = target[:10]  # some at distance zero before the motion, some of these on voxel faces
     scene = place(prepare_cloud(source), prepare_cloud(target), group.exp(np.full(group.dof, 0.2)))
-    pairs = nearest_pairs(scene, 0.6)
+    pairs = search(scene.target, gate_m)(scene.moved)
     distance = np.linalg.norm(scene.moved[:, None] - target[None], axis=2)
-    inside = np.flatnonzero(distance.min(axis=1) <= 0.6)
+    inside = np.flatnonzero(distance.min(axis=1) <= gate_m)
     np.testing.assert_array_equal(pairs.source, inside)
     np.testing.assert_array_equal(pairs.target, distance.argmin(axis=1)[inside])
     np.testing.assert_allclose(pairs.distance_m, distance.min(axis=1)[inside])
     backward = distance.argmin(axis=0)[pairs.target] == pairs.source
     np.testing.assert_array_equal(is_reciprocal(scene, pairs), backward)
-    assert 0 < backward.sum() < len(backward)
 
 
-def test_a_pair_at_the_gate_is_in() -> None:
+@searches
+def test_a_pair_at_the_gate_is_in(search: Callable[[Cloud, float], Association]) -> None:
     cloud = prepare_cloud(np.array([[0.0, 0], [1, 0], [0, 1]]))
     moved = place(prepare_cloud(cloud.points + np.array([-0.25, 0])), cloud, np.eye(3))
-    assert len(nearest_pairs(moved, 0.25)) == 3
-    assert len(nearest_pairs(moved, np.nextafter(0.25, 0))) == 0
+    assert len(search(cloud, 0.25)(moved.moved)) == 3
+    assert len(search(cloud, np.nextafter(0.25, 0))(moved.moved)) == 0
 
 
 def test_trimming_keeps_the_nearest_share() -> None:
@@ -143,3 +156,19 @@ def test_a_point_step_is_the_closed_form() -> None:
 def test_turning_and_moving_end_the_loop_apart(step: list[float], settled: bool) -> None:
     settings = IcpSettings(rotation_tolerance_rad=0.02, translation_tolerance_m=1e-3)
     assert has_settled(np.eye(3), SE2.exp(np.array(step)), settings) is settled
+
+
+@given(st.integers(0, 10_000), st.sampled_from([2, 3]), st.floats(0.05, 3))
+def test_voxels_find_what_the_tree_finds(seed: int, d: int, gate_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    target = prepare_cloud(rng.uniform(-2, 2, size=(rng.integers(1, 60), d)).round(1))  # on voxel faces, with ties
+    moved = np.vstack([rng.uniform(-4, 4, size=(30, d)), target.points])
+    tree, voxels = by_tree(target, gate_m)(moved), by_voxel_hash(target, gate_m)(moved)
+    np.testing.assert_array_equal(tree.source, voxels.source)
+    np.testing.assert_allclose(tree.distance_m, voxels.distance_m, atol=1e-12)
+
+
+def test_a_cloud_too_wide_for_its_gate_is_refused() -> None:
+    wide = prepare_cloud(np.array([[0.0, 0], [1e7, 0], [0, 1]]))
+    with pytest.raises(InputError, match="KD-tree"):
+        by_voxel_hash(wide, 0.1)
