@@ -90,7 +90,7 @@ def _register_chunk(work: _Work, settings: VerificationSettings) -> tuple[FloatA
         scans.lines,
         scans.kind,
         scans.thinned,
-        np.array([scans.angle_min_rad, scans.angle_increment_rad]),
+        scans.geometry,
     )
     return pose, hessian, measures
 
@@ -100,9 +100,9 @@ SEARCH_BEYOND_M = 0.25
 
 
 @kernel
-def register_many(
+def register_many(  # type: ignore[no-untyped-def]
     targets, sources, reach, poses, around, score_min, margin, search, matching, points, lines, kind, thinned, geometry
-):  # type: ignore[no-untyped-def]
+):
     """Register sources[m] to the keyframes targets[m] - around .. targets[m] + around for every m.
 
     Returns lidar poses (M, 3) in the frame of the target, Hessians (M, 3, 3), and score, matched fraction, agreement,

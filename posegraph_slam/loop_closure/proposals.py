@@ -133,7 +133,8 @@ def propose_proximity(
     at = places(path_m, settings)
     drift = min(2 * float(drift_sigma_m(np.array(travel_max_m), settings)), settings.drift_max_m)
     pairs = np.sort(cKDTree(positions[at]).query_pairs(settings.view_distance_m + drift, output_type="ndarray"), axis=1)
-    pairs = pairs[path_m[at[pairs[:, 1]]] - path_m[at[pairs[:, 0]]] >= settings.travel_min_m]
+    apart = path_m[at[pairs[:, 1]]] - path_m[at[pairs[:, 0]]] >= settings.travel_min_m
+    pairs = pairs[apart & (at[pairs[:, 1]] - at[pairs[:, 0]] >= settings.keyframes_apart_min)]
     length = uncovered_travel(path_m, at, pairs, closures, travel_max_m, settings.segment_length_m)
     pairs, length = pairs[np.isfinite(length)], length[np.isfinite(length)]
     older, newer = at[pairs[:, 0]], at[pairs[:, 1]]

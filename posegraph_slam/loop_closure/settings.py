@@ -26,9 +26,11 @@ class ProposalSettings(Settings):
     """Least travel between two places, counted through closures that are already accepted."""
     travel_first_m: float = Field(default=40.0, gt=0)
     """Longest travel of the first round; each round doubles it, so that short loops are closed first."""
-    drift_per_m: float = Field(default=0.03, gt=0)
+    keyframes_apart_min: int = Field(default=0, ge=0)
+    """Least number of keyframes between two places."""
+    drift_per_m: float = Field(default=0.03, ge=0)
     """One sigma of position drift per metre of travel."""
-    drift_rad_per_m: float = Field(default=0.0015, gt=0)
+    drift_rad_per_m: float = Field(default=0.0015, ge=0)
     """One sigma of heading drift per metre of travel."""
     drift_max_m: float = Field(default=12.0, gt=0)
     """The search window never reaches further than this,"""

@@ -26,7 +26,7 @@ class ScanMatchingSettings(Settings):
     """How scans are chained into a trajectory."""
 
     matcher: Literal["local_map", "scan_to_scan", "none"] = "local_map"
-    """`local_map` matches to lines of the last keyframes, `scan_to_scan` by ICP to the scan before, `none` is odometry."""
+    """`local_map`: to lines of the last keyframes; `scan_to_scan`: ICP to the scan before; `none`: odometry alone."""
     references: int = Field(default=4, ge=1, le=64)
     """Keyframes that form the local map."""
     keyframe_distance_m: float = Field(default=0.3, gt=0)
@@ -135,7 +135,7 @@ def _track_local_map(
         scans.lines,
         scans.kind,
         scans.thinned,
-        np.array([scans.angle_min_rad, scans.angle_increment_rad]),
+        scans.geometry,
     )
     assert stats.shape[1] == STATISTICS
     base = pose_from_xyt(poses) @ SE2.inverse(scans.T_base_lidar)

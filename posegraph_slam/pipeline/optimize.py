@@ -80,7 +80,7 @@ def optimize(
     with clock.stage("odometry"):
         odometry = odometry_at_scans(log, configuration.odometry)
     with clock.stage("scan matching"):
-        beams = prepare_beam_scans(scans, configuration.scans)
+        beams = prepare_beam_scans(scans, configuration.scans, executor)
         matched = match_scans(beams, odometry, configuration.scan_matching, executor=executor, progress=progress)
     with clock.stage("loop closure"):
         closed = close_loops(

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.jit import kernel
+from posegraph_slam.registration.beam_scans import GEOMETRY_HEAD
 from posegraph_slam.settings import Settings
 
 
@@ -71,85 +72,83 @@ def between(a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def nearest_beam(x, y, points, kind, angle_min, increment, gate):  # type: ignore[no-untyped-def]
-    """Return the beam of the return nearest to (x, y) within `gate`, or -1; exact, by growing the bearing window.
-
-    A return within distance d of a point at range r lies within asin(d / r) of its bearing.
-    """
-    beams = len(kind)
-    r2 = x * x + y * y
-    centre = int(np.round((np.arctan2(y, x) - angle_min) / increment))
-    turn = int(np.round(2 * np.pi / increment))
-    if centre < -(turn - beams) // 2:
-        centre += turn
-    elif centre >= beams + (turn - beams) // 2:
-        centre -= turn
-    best, best_d2 = -1, gate * gate
-    for offset in range(beams):
-        angle = (offset - 0.5) * increment
-        if offset > 0 and (angle > 0.5 * np.pi or r2 * np.sin(angle) ** 2 > best_d2):
-            break
-        for sign in (-1, 1):
-            if offset == 0 and sign == 1:
-                continue
-            k = centre + sign * offset
-            if beams >= turn:
-                k %= turn
-            if k < 0 or k >= beams or kind[k] == 0:
-                continue
-            d2 = (points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2
-            if d2 < best_d2:
-                best, best_d2 = k, d2
-    return best
-
-
-@kernel
 def accumulate(source, ref, pose, gate, robust, min_cosine, points, lines, kind, thinned, geometry, H, g):  # type: ignore[no-untyped-def]
     """Add the point-to-line terms of scan `source` at `pose` (in the frame of scan `ref`) to H (3, 3) and g (3,).
 
-    Weights follow Geman-McClure with scale `robust`. Returns the number of source points in view of the reference,
-    of those with a correspondence, the sum of weights and of weighted squared residuals.
+    The nearest return of the reference is found exactly by growing a window of bearings: a return within distance d
+    of a point at range r lies within asin(d / r) of its bearing. Weights follow Geman-McClure with scale `robust`.
+    Returns the number of source points in view of the reference, of those with a correspondence, the sum of weights
+    and of weighted squared residuals. All is in one body: a helper that takes arrays costs their reference counts
+    at every point.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     angle_min, increment = geometry[0], geometry[1]
     beams = kind.shape[1]
-    turn = 2 * np.pi
-    half_span = 0.5 * increment * (beams - 1)
-    middle = angle_min + half_span
+    turn = int(np.round(2 * np.pi / increment))
+    unseen = (turn - beams) // 2
+    q = robust * robust
     seen, matched, weight_sum, error_sum = 0, 0, 0.0, 0.0
+    h00, h01, h02, h11, h12, h22, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for b in range(beams):
         if not thinned[source, b]:
             continue
         px, py = points[source, b, 0], points[source, b, 1]
         x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
-        bearing = (np.arctan2(y, x) - middle + np.pi) % turn - np.pi
-        if abs(bearing) <= half_span:
+        r2 = x * x + y * y
+        centre = int(np.round((np.arctan2(y, x) - angle_min) / increment))
+        if centre < -unseen:
+            centre += turn
+        elif centre >= beams + unseen:
+            centre -= turn
+        if 0 <= centre < beams:
             seen += 1
-        k = nearest_beam(x, y, points[ref], kind[ref], angle_min, increment, gate)
-        if k < 0 or kind[ref, k] != 2:
+        best, best_d2 = -1, gate * gate
+        for offset in range(beams):
+            if r2 * geometry[GEOMETRY_HEAD + offset] > best_d2:
+                break
+            for side in range(2):
+                if offset == 0 and side == 1:
+                    continue
+                k = centre + offset if side == 1 else centre - offset
+                if beams >= turn:
+                    k %= turn
+                if k < 0 or k >= beams or kind[ref, k] == 0:
+                    continue
+                d2 = (points[ref, k, 0] - x) ** 2 + (points[ref, k, 1] - y) ** 2
+                if d2 < best_d2:
+                    best, best_d2 = k, d2
+        if best < 0 or kind[ref, best] != 2:
             continue
-        nx, ny = lines[ref, k, 0], lines[ref, k, 1]
+        nx, ny = lines[ref, best, 0], lines[ref, best, 1]
         if kind[source, b] == 2:
             mx, my = lines[source, b, 0], lines[source, b, 1]
             if nx * (c * mx - s * my) + ny * (s * mx + c * my) < min_cosine:
                 continue
-        e = nx * x + ny * y - lines[ref, k, 2]
-        q = robust * robust
+        e = nx * x + ny * y - lines[ref, best, 2]
         w = (q / (q + e * e)) ** 2
         j0, j1 = nx * c + ny * s, -nx * s + ny * c
         j2 = -j0 * py + j1 * px
-        H[0, 0] += w * j0 * j0
-        H[0, 1] += w * j0 * j1
-        H[0, 2] += w * j0 * j2
-        H[1, 1] += w * j1 * j1
-        H[1, 2] += w * j1 * j2
-        H[2, 2] += w * j2 * j2
-        g[0] += w * j0 * e
-        g[1] += w * j1 * e
-        g[2] += w * j2 * e
+        h00 += w * j0 * j0
+        h01 += w * j0 * j1
+        h02 += w * j0 * j2
+        h11 += w * j1 * j1
+        h12 += w * j1 * j2
+        h22 += w * j2 * j2
+        g0 += w * j0 * e
+        g1 += w * j1 * e
+        g2 += w * j2 * e
         matched += 1
         weight_sum += w
         error_sum += w * e * e
+    H[0, 0] += h00
+    H[0, 1] += h01
+    H[0, 2] += h02
+    H[1, 1] += h11
+    H[1, 2] += h12
+    H[2, 2] += h22
+    g[0] += g0
+    g[1] += g1
+    g[2] += g2
     return seen, matched, weight_sum, error_sum
 
 

@@ -7,16 +7,23 @@ Because beam k of a scan points at a known bearing, the neighbours of any point 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydantic import Field
 
-from posegraph_slam.arrays import BoolArray, Float32Array, FloatArray, IntArray, read_only
+from posegraph_slam.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
+from posegraph_slam.execution import Executor, SerialExecutor, split_range
 from posegraph_slam.geometry import planar_from_spatial
 from posegraph_slam.jit import kernel
 from posegraph_slam.sensors import LaserScans
 from posegraph_slam.settings import Settings
+
+GEOMETRY_HEAD = 2
+"""Entries of `BeamScans.geometry` before those of the offsets."""
+SCANS_A_CHUNK = 512
+"""Scans in one unit of work."""
 
 
 class BeamScanSettings(Settings):
@@ -47,7 +54,7 @@ class BeamScans:
 
     points: Float32Array
     lines: Float32Array
-    kind: np.ndarray[tuple[int, int], np.dtype[np.uint8]]
+    kind: ByteArray
     thinned: BoolArray
     angle_min_rad: float
     angle_increment_rad: float
@@ -64,6 +71,17 @@ class BeamScans:
     def __len__(self) -> int:
         return int(self.points.shape[0])
 
+    @property
+    def geometry(self) -> FloatArray:
+        """What kernels need of the beams: least angle, increment, and the least squared sine at each offset of beams.
+
+        Entry `GEOMETRY_HEAD` + k is sin((k - 1/2) increment)^2: a return k beams from the bearing of a point at range
+        r lies at least r times its root away; 0 for k = 0, infinite beyond a quarter turn.
+        """
+        angles = (np.arange(self.kind.shape[1]) - 0.5) * self.angle_increment_rad
+        squared = np.where(angles < 0.5 * np.pi, np.sin(np.maximum(angles, 0.0)) ** 2, np.inf)
+        return np.concatenate([[self.angle_min_rad, self.angle_increment_rad], squared])
+
     def select(self, index: IntArray) -> BeamScans:
         """Return the scans at `index`, in that order."""
         return BeamScans(
@@ -77,21 +95,24 @@ class BeamScans:
         )
 
 
-def prepare_beam_scans(scans: LaserScans, settings: BeamScanSettings) -> BeamScans:
-    """Turn ranges (N, B) into points with normals, dropping what is no trusted return."""
+def prepare_beam_scans(scans: LaserScans, settings: BeamScanSettings, executor: Executor | None = None) -> BeamScans:
+    """Turn ranges (N, B) into points with lines, dropping what is no trusted return."""
     if scans.angle_increment_rad <= 0:
         raise InputError("laser scans", f"angle increment {scans.angle_increment_rad} rad is not positive")
     lower = max(settings.range_min_m, scans.range_min_m)
     upper = min(settings.range_max_m, scans.range_max_m)
     cos, sin = np.cos(scans.angles_rad), np.sin(scans.angles_rad)
-    points, lines, kind, thinned = _prepare(
-        scans.ranges_m,
-        cos,
-        sin,
-        np.array([lower, upper, settings.normal_radius_m, settings.normal_gap_max_m]),
-        settings.surface_sigma_m,
-        settings.source_spacing_m,
+    prepare = partial(
+        _prepare_chunk,
+        cos=cos,
+        sin=sin,
+        limits=np.array([lower, upper, settings.normal_radius_m, settings.normal_gap_max_m]),
+        surface_sigma=settings.surface_sigma_m,
+        spacing=settings.source_spacing_m,
     )
+    chunks = [scans.ranges_m[start:stop] for start, stop in split_range(len(scans), SCANS_A_CHUNK)]
+    parts = (executor or SerialExecutor()).map(prepare, chunks)
+    points, lines, kind, thinned = (np.concatenate([part[k] for part in parts]) for k in range(4))
     return BeamScans(
         points=points,
         lines=lines,
@@ -101,6 +122,13 @@ def prepare_beam_scans(scans: LaserScans, settings: BeamScanSettings) -> BeamSca
         angle_increment_rad=scans.angle_increment_rad,
         T_base_lidar=planar_from_spatial(scans.T_base_lidar),
     )
+
+
+def _prepare_chunk(
+    ranges: Float32Array, cos: FloatArray, sin: FloatArray, limits: FloatArray, surface_sigma: float, spacing: float
+) -> tuple[Float32Array, Float32Array, ByteArray, BoolArray]:
+    points, lines, kind, thinned = _prepare(ranges, cos, sin, limits, surface_sigma, spacing)
+    return points, lines, kind, thinned
 
 
 @kernel

@@ -53,7 +53,7 @@ def _place(refs, ref_poses, range_max, points, kind):  # type: ignore[no-untyped
 
 @kernel
 def _source_points(source, range_max, points_max, points, thinned):  # type: ignore[no-untyped-def]
-    """Evenly picked points (n, 2) of the thinned scan within `range_max`, `points_max` at most, and their largest range."""
+    """Evenly picked points (n, 2), `points_max` at most, of the scan within `range_max`, and their largest range."""
     beams = thinned.shape[1]
     chosen = np.empty(beams, np.int64)
     count, farthest = 0, 0.0

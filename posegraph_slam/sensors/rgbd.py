@@ -58,6 +58,5 @@ class RgbdFrames:
         """Index (n,) of the colour frame nearest in time to each stamp."""
         clock = self.colour_stamps_s
         after = np.clip(np.searchsorted(clock, stamps_s), 1, max(len(clock) - 1, 1))
-        return np.asarray(after, dtype=np.int64) - (
-            stamps_s - clock[after - 1] < clock[np.minimum(after, len(clock) - 1)] - stamps_s
-        )
+        earlier = stamps_s - clock[after - 1] < clock[after] - stamps_s
+        return np.asarray(after - earlier, dtype=np.int64)
