@@ -164,3 +164,10 @@ def test_stage_clock_adds_up_repeated_stages() -> None:
     assert list(clock.seconds) == ["match", "solve"]
     assert all(seconds >= 0 for seconds in clock.seconds.values())
     assert peak_memory_mib() > 10
+
+
+def test_peak_memory_follows_what_is_allocated() -> None:
+    before = peak_memory_mib()
+    block = np.ones(2**23 + int(before) * 2**17)  # 64 MiB more than ever before
+    assert peak_memory_mib() >= before + 60
+    assert block[0] == 1
