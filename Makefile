@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 SIMULATION := $(wildcard posegraph_slam/datasets/simulation/*.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint benchmark lock clean distclean
+.PHONY: help demo test lint benchmark lock presets clean distclean
 
 help:
 	@echo 'make demo       install, simulate a small indoor log, optimise it, show the comparison and the pictures'
@@ -17,6 +17,7 @@ help:
 	@echo 'make lint       format check, lint and type check only'
 	@echo 'make benchmark  run benchmarks/*.py on the logs in PSG_DATA'
 	@echo 'make lock       write constraints.txt from what .venv holds'
+	@echo 'make presets    write configs/default.toml from the defaults in the code'
 	@echo 'make clean      remove caches, the demo and build output; distclean removes .venv too'
 
 $(BIN)/python:
@@ -54,6 +55,9 @@ benchmark: $(VENV)/.installed-dev
 
 lock: $(VENV)/.installed-dev
 	@$(BIN)/python tools/lock.py > constraints.txt.new && mv constraints.txt.new constraints.txt
+
+presets: $(VENV)/.installed
+	@$(BIN)/psg config show > default.toml.new && mv default.toml.new configs/default.toml
 
 clean:
 	rm -rf demo build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

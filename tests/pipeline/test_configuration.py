@@ -212,7 +212,7 @@ def test_every_key_of_the_configuration_is_described_and_bounded() -> None:
 def test_default_preset_is_what_the_models_say() -> None:
     written = find_configuration("default").read_text(encoding="utf-8")
     generated = to_toml(Configuration())
-    assert written == generated, "renew it: psg config show > configs/default.toml"
+    assert written == generated, "renew it: make presets"
 
 
 @pytest.mark.parametrize("name", sorted(available_presets()))
