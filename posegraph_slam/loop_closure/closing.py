@@ -74,7 +74,7 @@ def close_loops(
         found = _verify(candidates, graph, scans, path_m, round_, ledger, settings.verification, executor)
         if len(found):
             closures = Constraints.concatenate([closures, found])
-            graph, sigmas, kept = _settle(graph, chain, closures, solver, settings.verification.sigma_max)
+            graph, sigmas, kept = settle(graph, chain, closures, solver, settings.verification.sigma_max)
             ledger.settle(sigmas, kept)
             closures = closures.select(kept)
         round_ += 1
@@ -150,7 +150,7 @@ def _constraints(
     )
 
 
-def _settle(
+def settle(
     graph: PoseGraph, chain: Constraints, closures: Constraints, solver: SolverSettings, sigma_max: float
 ) -> tuple[PoseGraph, FloatArray, BoolArray]:
     """Solve with all closures, then without those beyond the gate, worst first, taking back those that fit in the end.
