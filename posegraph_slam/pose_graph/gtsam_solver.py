@@ -7,7 +7,6 @@ are held by NonlinearEquality: unlike a tight prior it holds several nodes exact
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -22,6 +21,7 @@ from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings
 from posegraph_slam.pose_graph.solver_settings import (
     EliminationOrdering,
     IterationRecord,
+    OptimizerRun,
     SolverMethod,
     SolverSettings,
     StopReason,
@@ -31,15 +31,6 @@ LAMBDA_UPPER_BOUND = 1e5
 """GTSAM's default; past it no step was found."""
 DENSE_EDGES_PER_NODE = 4
 """Above this METIS wins: 3000 nodes with 30000 edges take 0.19 s an iteration, 0.30 s with COLAMD."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OptimizerRun:
-    """Best poses (N, d+1, d+1) that an optimiser met, why it stopped, and its record."""
-
-    poses: FloatArray
-    stop_reason: StopReason
-    record: IterationRecord
 
 
 def to_poses(poses: FloatArray) -> list[Any]:

@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 from pydantic import Field
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import BoolArray, FloatArray
 from posegraph_slam.settings import Settings
 
 
@@ -83,3 +83,15 @@ def robust_costs(chi2: FloatArray, settings: RobustSettings) -> FloatArray:
             return np.where(chi2 <= c, 0.5 * chi2, 1.5 * c - 2 * c**2 / (c + chi2))
         case RobustLoss.NONE:
             return 0.5 * chi2
+
+
+def constraint_costs(is_loop: BoolArray, chi2: FloatArray, settings: RobustSettings) -> FloatArray:
+    """Return the cost (E,) of each constraint: under the loss for loops, half of chi-square for the others."""
+    if settings.loss is RobustLoss.NONE:
+        return 0.5 * chi2
+    return np.where(is_loop, robust_costs(chi2, settings), 0.5 * chi2)
+
+
+def constraint_weights(is_loop: BoolArray, chi2: FloatArray, settings: RobustSettings) -> FloatArray:
+    """Return the robust weight (E,) of each constraint; 1 for those that close no loop."""
+    return np.where(is_loop, robust_weights(chi2, settings), 1.0)

@@ -12,6 +12,16 @@ from posegraph_slam.pose_graph.robust import RobustSettings
 from posegraph_slam.settings import Settings
 
 
+class SolverKind(StrEnum):
+    """Which implementation solves."""
+
+    AUTO = "auto"
+    """The sparse one where it knows the method."""
+    GTSAM = "gtsam"
+    SPARSE = "sparse"
+    """The package's own: Levenberg-Marquardt and Gauss-Newton on a block Cholesky factorisation."""
+
+
 class SolverMethod(StrEnum):
     """How each step is chosen."""
 
@@ -32,6 +42,7 @@ class EliminationOrdering(StrEnum):
 class SolverSettings(Settings):
     """How a pose graph is solved."""
 
+    kind: SolverKind = Field(default=SolverKind.AUTO, description="auto, gtsam or sparse")
     method: SolverMethod = Field(
         default=SolverMethod.LEVENBERG_MARQUARDT, description="levenberg_marquardt, gauss_newton or dogleg"
     )
@@ -74,6 +85,15 @@ class IterationRecord:
     def __post_init__(self) -> None:
         for name in ("cost", "lambda_", "seconds"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OptimizerRun:
+    """Best poses (N, d+1, d+1) that an optimiser met, why it stopped, and its record."""
+
+    poses: FloatArray
+    stop_reason: StopReason
+    record: IterationRecord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
