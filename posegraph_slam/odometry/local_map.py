@@ -18,17 +18,21 @@ def track(increments, sigmas, scheme, search, matching, points, lines, kind, thi
 
     `increments` (N, 3) and `sigmas` (N, 3) are the odometry step to each scan in the lidar frame; `scheme` holds the
     number of references, keyframe distance and turn, the least matched fraction, and reach in metres and radians of
-    the search that is made when fewer match or the odometry leaps (sigma of the turn beyond its reach).
+    the search that is made when fewer match or the odometry leaps (sigma of the turn beyond its reach), and 1 where
+    there is no odometry, so that the last motion is taken to go on (stamps of old loggers are useless for a velocity).
     Returns lidar poses (N, 3), statistics (N, 7), Hessians (N, 3, 3) and the scans that are keyframes.
     """
     count = len(increments)
     poses, hessians, stats = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, STATISTICS))
     keyframes = np.zeros(count, np.int64)
     keyposes = np.zeros((count, 3))
-    references, known = int(scheme[0]), 1
+    references, known, coasting = int(scheme[0]), 1, scheme[6] > 0
     prior = np.zeros((3, 3))
     for i in range(1, count):
-        start = compose(poses[i - 1], increments[i])
+        if coasting and i > 1:
+            start = compose(poses[i - 1], between(poses[i - 2], poses[i - 1]))
+        else:
+            start = compose(poses[i - 1], increments[i])
         first = max(0, known - references)
         refs, ref_poses = keyframes[first:known], keyposes[first:known]
         for k in range(3):

@@ -123,6 +123,7 @@ def _track_local_map(
             settings.matched_fraction_min,
             settings.search_reach_m,
             settings.search_reach_rad,
+            float(odometry.source == "none"),
         ]
     )
     poses, stats, hessians, keyframes = track(

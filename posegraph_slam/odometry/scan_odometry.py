@@ -44,11 +44,19 @@ def chosen_source(log: RobotLog, wanted: OdometrySource = "auto") -> OdometrySou
         "none": True,
     }
     if wanted == "auto":
-        return next(source for source, there in present.items() if there)
+        unmoved = not _moves(log.scan_odometry) and not _moves(log.odometry)
+        return next(source for source, there in present.items() if there and not (source == "logged" and unmoved))
     if not present[wanted]:
         have = ", ".join(source for source, there in present.items() if there)
         raise ConfigurationError("odometry.source", f"'{wanted}' is not in {log.path}", f"choose auto, {have}")
     return wanted
+
+
+def _moves(trajectory: Trajectory | None) -> bool:
+    """Whether there are poses, and not one and the same at all times, as loggers write that know no odometry."""
+    if trajectory is None or len(trajectory) == 0:
+        return False
+    return len(trajectory) == 1 or not bool(np.all(np.abs(trajectory.poses - trajectory.poses[0]) <= 1e-9))
 
 
 def _logged(log: RobotLog, stamps: FloatArray, settings: OdometrySettings) -> OdometryEstimate:

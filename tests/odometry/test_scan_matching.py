@@ -91,6 +91,16 @@ def test_without_odometry_scans_alone_give_the_motion(log: RobotLog) -> None:
     assert rmse(log, result) < 0.05
 
 
+def test_a_logger_that_knows_no_odometry_is_coasted(log: RobotLog) -> None:
+    assert log.scans is not None
+    still = log.scans.stamps_s, np.tile(np.eye(3), (len(log.scans), 1, 1))
+    zero = Trajectory(stamps_s=still[0], poses=still[1], parent="odom", child="base")
+    bare = dataclasses.replace(log, encoders=None, imu=None, scan_odometry=zero)
+    odometry = odometry_at_scans(bare)
+    assert odometry.source == "none"
+    assert rmse(log, match_scans(prepared(bare), odometry, ScanMatchingSettings())) < 0.05
+
+
 def test_heading_does_not_drift_to_one_side() -> None:
     """Matches whose errors prefer a side turn a long corridor into a bow."""
     turned: list[float] = []

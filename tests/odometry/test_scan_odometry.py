@@ -197,12 +197,15 @@ def test_the_source_is_chosen_by_what_the_log_has() -> None:
         stamps_s=stamps, angular_velocity=np.zeros((50, 3)), linear_acceleration=np.zeros((50, 3)),
         T_base_imu=np.eye(4),
     )  # fmt: skip
-    everything = logged(stamps, np.zeros((50, 3)), encoders=wheels(stamps), imu=imu)
+    moving = np.column_stack([stamps, np.zeros((50, 2))])
+    everything = logged(stamps, moving, encoders=wheels(stamps), imu=imu)
     assert chosen_source(everything) == "logged"
     for source in ("logged", "wheels_imu", "wheels", "none"):
         assert odometry_at_scans(everything, OdometrySettings(source=source)).source == source
     bare = RobotLog(path=Path("log"), format="test", scans=scans_at(stamps), encoders=wheels(stamps))
     assert chosen_source(bare) == "wheels"
+    assert chosen_source(logged(stamps, np.zeros((50, 3)), encoders=wheels(stamps))) == "wheels"
+    assert chosen_source(logged(stamps, np.zeros((50, 3)))) == "none"
     with pytest.raises(ConfigurationError, match=r"odometry.source: 'logged' is not in log; choose auto, wheels, none"):
         odometry_at_scans(bare, OdometrySettings(source="logged"))
 
@@ -218,7 +221,7 @@ def test_logged_poses_that_are_not_finite_or_too_few_are_refused() -> None:
     xyt[2, 0] = np.nan
     with pytest.raises(InputError, match="odometry pose 2 is not finite"):
         odometry_at_scans(logged(np.arange(4.0), xyt))
-    log = logged(np.arange(4.0), np.zeros((4, 3)))
+    log = logged(np.arange(4.0), np.column_stack([np.arange(4.0), np.zeros((4, 2))]))
     short = RobotLog(path=log.path, format="carmen", scans=scans_at(np.arange(5.0)), scan_odometry=log.scan_odometry)
     with pytest.raises(InputError, match="4 odometry poses for 5 scans"):
         odometry_at_scans(short)
