@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.execution import Executor, split_range
 from posegraph_slam.geometry import pose_from_xyt, xyt_from_pose
 from posegraph_slam.jit import kernel
@@ -36,6 +36,8 @@ class Evidence:
     agreement: FloatArray
     overlap: FloatArray
     rmse_m: FloatArray
+    ambiguous: BoolArray
+    """Whether another pose of the window fits nearly as well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,7 +63,7 @@ def register_candidates(
     ]
     parts = executor.map(partial(_register_chunk, settings=settings), work)
     if not parts:
-        parts = [(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 5)))]
+        parts = [(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 6)))]
     pose, hessian, measures = (np.concatenate([part[k] for part in parts]) for k in range(3))
     return Evidence(
         T_target_source=pose_from_xyt(pose),
@@ -71,6 +73,7 @@ def register_candidates(
         agreement=measures[:, 2],
         overlap=measures[:, 3],
         rmse_m=measures[:, 4],
+        ambiguous=measures[:, 5] > 0,
     )
 
 
@@ -106,10 +109,10 @@ def register_many(  # type: ignore[no-untyped-def]
     """Register sources[m] to the keyframes targets[m] - around .. targets[m] + around for every m.
 
     Returns lidar poses (M, 3) in the frame of the target, Hessians (M, 3, 3), and score, matched fraction, agreement,
-    overlap and rmse (M, 5).
+    overlap, rmse and whether a rival was found (M, 6).
     """
     count = len(targets)
-    found, hessians, measures = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 5))
+    found, hessians, measures = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 6))
     prior = np.eye(3) * 1e-3
     for m in range(count):
         target, source = targets[m], sources[m]
@@ -121,9 +124,9 @@ def register_many(  # type: ignore[no-untyped-def]
         ref_poses = np.zeros((len(refs), 3))
         for r in range(len(refs)):
             ref_poses[r] = between(poses[target], poses[refs[r]])
-        pose, score = between(poses[target], poses[source]), 1.0
+        pose, score, rival = between(poses[target], poses[source]), 1.0, False
         if reach[m, 0] > SEARCH_BEYOND_M:
-            pose, score = search_pose(
+            pose, score, rival = search_pose(
                 source, refs, ref_poses, pose, reach[m, 0], reach[m, 1], score_min, search, points, kind, thinned
             )
             if score == 0.0:
@@ -145,4 +148,5 @@ def register_many(  # type: ignore[no-untyped-def]
         measures[m, 2] = min(agree / max(agree + conflict, 1), back_agree / max(back_agree + back_conflict, 1))
         measures[m, 3] = agree / max(agree + conflict + hidden, 1)
         measures[m, 4] = stats[3]
+        measures[m, 5] = rival
     return found, hessians, measures

@@ -42,7 +42,7 @@ def track(increments, sigmas, scheme, search, matching, points, lines, kind, thi
         )
         leap = sigmas[i, 2] > 0.5 * scheme[5]
         if leap or stat[1] < scheme[3] * stat[0]:
-            best, score = search_pose(
+            best, score, _ = search_pose(
                 i, refs, ref_poses, start, scheme[4], scheme[5], 0.4, search, points, kind, thinned
             )
             stats[i, 6] = 1.0

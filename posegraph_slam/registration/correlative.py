@@ -97,13 +97,19 @@ def exhaustive_search(field, cells, reach):  # type: ignore[no-untyped-def]
     return best_a, best_x, best_y, best
 
 
+NO_DISC = (0, 0, -1)
+"""Centre and radius in cells of a disc that excludes nothing."""
+
+
 @kernel
-def branch_and_bound(stack, cells, reach, least):  # type: ignore[no-untyped-def]
+def branch_and_bound(stack, cells, reach, least, disc):  # type: ignore[no-untyped-def]
     """Best (angle index, dx, dy, score sum) within `reach` cells whose score exceeds `least`, else score -1.
 
     Blocks are visited in the order of their bounds; a block whose bound does not exceed the best score is dropped.
-    `stack` must be padded by at least 2^levels cells, so that a block may start before the field.
+    `stack` must be padded by at least 2^levels cells, so that a block may start before the field. Shifts within the
+    `disc` (x, y, radius) are left out, so that a rival of a pose already found can be sought.
     """
+    inside = disc[2] * disc[2] if disc[2] >= 0 else -1
     levels = len(stack) - 1
     width = 1 << levels
     blocks = (2 * reach) // width + 1
@@ -131,6 +137,11 @@ def branch_and_bound(stack, cells, reach, least):  # type: ignore[no-untyped-def
             top -= 1
             x, y, level, bound = todo[top, 0], todo[top, 1], todo[top, 2], todo[top, 3]
             if bound <= best:
+                continue
+            size = (1 << level) - 1
+            corner_x = max(abs(x - disc[0]), abs(x + size - disc[0]))
+            corner_y = max(abs(y - disc[1]), abs(y + size - disc[1]))
+            if corner_x * corner_x + corner_y * corner_y <= inside:
                 continue
             if level == 0:
                 best_a, best_x, best_y, best, found = a, x, y, bound, True

@@ -9,6 +9,7 @@ from posegraph_slam.arrays import FloatArray
 from posegraph_slam.jit import kernel
 from posegraph_slam.registration.correlative import (
     FIELD_MAX,
+    NO_DISC,
     branch_and_bound,
     likelihood_field,
     max_pooled,
@@ -29,9 +30,23 @@ class LocalSearchSettings(Settings):
     points_max: int = Field(default=120, ge=10)
     """The scan is represented by at most this many points."""
 
+    rival_share: float = Field(default=0.9, gt=0, le=1)
+    """A pose elsewhere in the window that reaches this share of the best score makes the result ambiguous; 1: never."""
+    rival_distance_m: float = Field(default=1.5, gt=0)
+    """Elsewhere is further than this from the best pose."""
+
     def vector(self) -> FloatArray:
         """Return the values in the order that `search_pose` expects."""
-        return np.array([self.resolution_m, self.sigma_m, self.range_max_m, self.points_max])
+        return np.array(
+            [
+                self.resolution_m,
+                self.sigma_m,
+                self.range_max_m,
+                self.points_max,
+                self.rival_share,
+                self.rival_distance_m,
+            ]
+        )
 
 
 @kernel
@@ -75,14 +90,17 @@ def _source_points(source, range_max, points_max, points, thinned):  # type: ign
 def search_pose(source, refs, ref_poses, start, reach_m, reach_rad, score_min, settings, points, kind, thinned):  # type: ignore[no-untyped-def]
     """Find the pose of scan `source` within `reach_m` and `reach_rad` of `start` that fits the scans `refs` best.
 
-    `ref_poses` (R, 3) and `start` share one frame; `settings` as from `LocalSearchSettings.vector`. Returns the pose
-    and its score in [0, 1]; `start` and 0 when no pose scores `score_min`, or there is nothing to compare.
+    `ref_poses` (R, 3) and `start` share one frame; `settings` as from `LocalSearchSettings.vector`. Returns the pose,
+    its score in [0, 1], and whether a pose elsewhere scores nearly as high (`rival_share`); `start`, 0 and False when
+    no pose scores `score_min`, or there is nothing to compare.
     """
     resolution, sigma, range_max, points_max = settings[0], settings[1], settings[2], int(settings[3])
+    rival_share, rival_distance = settings[4], settings[5]
     target = _place(refs, ref_poses, range_max, points, kind)
     cloud, farthest = _source_points(source, range_max, points_max, points, thinned)
     if len(target) < 10 or len(cloud) < 10:
-        return start.copy(), 0.0
+        return start.copy(), 0.0, False
+    apart = int(np.ceil(rival_distance / resolution))
     reach = max(int(np.ceil(reach_m / resolution)), 1)
     levels = 0
     while levels < 6 and (2 << levels) <= reach:
@@ -97,10 +115,12 @@ def search_pose(source, refs, ref_poses, start, reach_m, reach_rad, score_min, s
     half = int(np.ceil(reach_rad / step))
     angles = step * np.arange(-half, half + 1)
     cells = rotated_cells(cloud, start, angles, origin, resolution, pad)
-    a, dx, dy, score = branch_and_bound(
-        max_pooled(field, levels), cells, reach, int(score_min * FIELD_MAX * len(cloud))
-    )
+    stack = max_pooled(field, levels)
+    a, dx, dy, score = branch_and_bound(stack, cells, reach, int(score_min * FIELD_MAX * len(cloud)), NO_DISC)
     if score < 0:
-        return start.copy(), 0.0
+        return start.copy(), 0.0, False
+    rival = False
+    if reach > apart and rival_share < 1.0:
+        rival = branch_and_bound(stack, cells, reach, int(rival_share * score), (dx, dy, apart))[3] >= 0
     pose = np.array([start[0] + dx * resolution, start[1] + dy * resolution, start[2] + angles[a]])
-    return pose, score / (FIELD_MAX * len(cloud))
+    return pose, score / (FIELD_MAX * len(cloud)), rival

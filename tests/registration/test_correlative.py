@@ -13,6 +13,8 @@ from posegraph_slam.registration.beam_matching import between, compose
 from posegraph_slam.registration.beam_scans import BeamScanSettings, prepare_beam_scans
 from posegraph_slam.registration.correlative import (
     FIELD_MAX,
+    NO_DISC,
+    block_score,
     branch_and_bound,
     exhaustive_search,
     likelihood_field,
@@ -35,11 +37,31 @@ def test_branch_and_bound_scores_as_high_as_every_pose_tried(
     field = likelihood_field(target, origin, RESOLUTION, 70, 70, pad, SIGMA)
     cells = rotated_cells(source, np.zeros(3), np.linspace(-0.3, 0.3, 7), origin, RESOLUTION, pad)
     best = exhaustive_search(field, cells, reach)
-    found = branch_and_bound(max_pooled(field, levels), cells, reach, 0)
+    found = branch_and_bound(max_pooled(field, levels), cells, reach, 0, NO_DISC)
     assert found[3] == best[3] or (best[3] == 0 and found[3] == -1)
-    assert branch_and_bound(max_pooled(field, levels), cells, reach, best[3])[3] == -1
+    assert branch_and_bound(max_pooled(field, levels), cells, reach, best[3], NO_DISC)[3] == -1
     if found[3] > 0:
         assert max(abs(found[1]), abs(found[2])) <= reach
+
+
+@given(seed=st.integers(0, 10_000), levels=st.integers(0, 4), radius=st.integers(0, 9))
+def test_the_best_rival_lies_outside_the_disc(seed: int, levels: int, radius: int) -> None:
+    rng = np.random.default_rng(seed)
+    origin, pad, reach = np.array([-3.5, -3.5]), 1 << levels, 12
+    field = likelihood_field(rng.uniform(-3, 3, (60, 2)), origin, RESOLUTION, 70, 70, pad, SIGMA)
+    cells = rotated_cells(rng.uniform(-3, 3, (20, 2)), np.zeros(3), np.array([0.0, 0.2]), origin, RESOLUTION, pad)
+    centre = rng.integers(-12, 13, 2)
+    shifts = np.arange(-reach, reach + 1)
+    scores = [
+        block_score(field, turned, dx, dy)
+        for turned in cells
+        for dx in shifts
+        for dy in shifts
+        if (dx - centre[0]) ** 2 + (dy - centre[1]) ** 2 > radius**2
+    ]
+    disc = (int(centre[0]), int(centre[1]), radius)
+    found = branch_and_bound(max_pooled(field, levels), cells, reach, 0, disc)
+    assert found[3] == max(scores) or (max(scores) == 0 and found[3] == -1)
 
 
 def test_pooled_levels_hold_the_maximum_of_their_blocks() -> None:
@@ -72,12 +94,13 @@ def test_a_wide_window_is_searched_to_the_true_pose() -> None:
     arrays = (LocalSearchSettings().vector(), scans.points, scans.kind, scans.thinned)
     for offset in ([1.2, -0.8, 0.5], [-1.5, 0.4, -0.6]):
         start = compose(truth, np.array(offset))
-        pose, score = search_pose(32, np.array([30]), np.zeros((1, 3)), start, 2.0, 0.8, 0.3, *arrays)
+        pose, score, rival = search_pose(32, np.array([30]), np.zeros((1, 3)), start, 2.0, 0.8, 0.3, *arrays)
         error = between(truth, pose)
         assert np.hypot(error[0], error[1]) < 0.15
         assert abs(error[2]) < 0.05
         assert score > 0.5
-    pose, score = search_pose(32, np.array([30]), np.zeros((1, 3)), start, 2.0, 0.8, 0.999, *arrays)
+        assert not rival
+    pose, score, rival = search_pose(32, np.array([30]), np.zeros((1, 3)), start, 2.0, 0.8, 0.999, *arrays)
     assert score == 0.0
     np.testing.assert_array_equal(pose, start)
 
@@ -88,7 +111,7 @@ def test_nothing_to_compare_scores_zero(empty: str) -> None:
     kind = np.ones((2, 40), dtype=np.uint8)
     kind[0 if empty == "source" else 1] = 0
     start = np.array([1.0, 2.0, 0.3])
-    pose, score = search_pose(
+    pose, score, rival = search_pose(
         0, np.array([1]), np.zeros((1, 3)), start, 1.0, 0.5, 0.1, LocalSearchSettings().vector(),
         points, kind, kind > 0,
     )  # fmt: skip
