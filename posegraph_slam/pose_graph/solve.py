@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pose_graph.checks import check_graph
@@ -48,12 +47,15 @@ def solve(
     settings = SolverSettings() if settings is None else settings
     check_graph(graph)
     cost_initial = graph_cost(graph, settings.robust)
-    best = (run_sparse if chosen_kind(settings) is SolverKind.SPARSE else run_gtsam)(graph, settings, progress)
+    best = _run(graph, settings, progress)
     best_cost, notes = graph_cost(graph.with_poses(best.poses), settings.robust), []
-    optimal = _is_optimum(graph, best, settings)
+    optimal, warm = _is_optimum(graph, best, settings), best.poses
     for attempt in _attempts(graph, settings, best.stop_reason) if settings.retry and not optimal else ():
-        run = _try(graph, best.poses, attempt, settings, progress)
         notes.append(attempt.note)
+        if attempt.easier is not None:  # each easier graph starts where the one before ended: a continuation
+            warm = _run(attempt.easier.with_poses(warm), attempt.settings, progress).poses
+        start = graph.with_poses(best.poses if attempt.easier is None else warm)
+        run = _run(start, attempt.settings, progress, orthogonal=attempt.orthogonal)
         cost = graph_cost(graph.with_poses(run.poses), settings.robust)
         if cost < best_cost:
             best, best_cost = run, cost
@@ -108,6 +110,12 @@ def clamp_information(constraints: Constraints, largest: float) -> Constraints:
     )
 
 
+def _run(graph: PoseGraph, settings: SolverSettings, progress: Progress, *, orthogonal: bool = False) -> OptimizerRun:
+    if chosen_kind(settings) is SolverKind.SPARSE:
+        return run_sparse(graph, settings, progress)
+    return run_gtsam(graph, settings, progress, orthogonal=orthogonal)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Attempt:
     """Something to try after a stall: a graph to solve first for a start, if any, and how to solve from there."""
@@ -124,7 +132,8 @@ def _attempts(graph: PoseGraph, settings: SolverSettings, reason: StopReason) ->
     metis, colamd = EliminationOrdering.METIS, EliminationOrdering.COLAMD
     other = colamd if chosen_ordering(graph, settings.ordering) is metis else metis
     if reason is not StopReason.MAX_ITERATIONS:
-        yield _Attempt(note=f"tried {other} ordering", settings=damped.model_copy(update={"ordering": other}))
+        changes = {"ordering": other, "kind": SolverKind.GTSAM}
+        yield _Attempt(note=f"tried GTSAM with {other} ordering", settings=damped.model_copy(update=changes))
     largest = np.linalg.eigvalsh(graph.constraints.information)[:, -1]
     caps = [factor * float(np.median(largest)) for factor in CLAMPS]
     for cap in (cap for cap in caps if np.any(largest > cap)):
@@ -132,19 +141,8 @@ def _attempts(graph: PoseGraph, settings: SolverSettings, reason: StopReason) ->
         note = f"tried a start with information clamped at {cap:.3g}"
         yield _Attempt(note=note, settings=damped, easier=clamped)
     if np.any(largest > caps[-1]):
-        yield _Attempt(note="tried QR elimination", settings=damped, orthogonal=True)
-
-
-def _try(
-    graph: PoseGraph, best: FloatArray, attempt: _Attempt, settings: SolverSettings, progress: Progress
-) -> OptimizerRun:
-    """Solve from the best poses so far, or from those of the easier graph if they cost less."""
-    start = graph.with_poses(best)
-    if attempt.easier is not None:
-        warm = graph.with_poses(run_gtsam(attempt.easier.with_poses(best), attempt.settings, progress).poses)
-        if graph_cost(warm, settings.robust) < graph_cost(start, settings.robust):
-            start = warm
-    return run_gtsam(start, attempt.settings, progress, orthogonal=attempt.orthogonal)
+        gtsam = damped.model_copy(update={"kind": SolverKind.GTSAM})
+        yield _Attempt(note="tried GTSAM with QR elimination", settings=gtsam, orthogonal=True)
 
 
 def _is_optimum(graph: PoseGraph, run: OptimizerRun, settings: SolverSettings) -> bool:

@@ -17,7 +17,7 @@ from posegraph_slam.pose_graph.solve import (
     possible_decrease,
     solve,
 )
-from posegraph_slam.pose_graph.solver_settings import SolverMethod, SolverSettings, StopReason
+from posegraph_slam.pose_graph.solver_settings import SolverKind, SolverMethod, SolverSettings, StopReason
 
 Maker = Callable[..., PoseGraph]
 Change = Callable[..., Constraints]
@@ -45,7 +45,7 @@ def shaken(graph: PoseGraph, poses: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("method", list(SolverMethod))
 def test_every_method_reaches_the_optimum(graph_maker: Maker, group: Group, method: SolverMethod) -> None:
-    graph = graph_maker(group, nodes=12, loops=10)
+    graph = graph_maker(group, nodes=8, loops=6)
     result = solve(graph, SolverSettings(method=method))
     assert result.stop_reason is StopReason.CONVERGED
     assert result.cost == pytest.approx(dense_optimum(graph), rel=1e-7)
@@ -93,14 +93,15 @@ def test_a_huge_information_does_not_return_the_start(
     information[10] = (rotation * spectrum) @ rotation.T
     information[10] = 0.5 * (information[10] + information[10].T)
     stiff = graph.with_constraints(change(graph.constraints, information=information))
-    silent = solve(stiff, SolverSettings(retry=False))
-    result = solve(stiff)
+    silent = solve(stiff, SolverSettings(kind=SolverKind.GTSAM, retry=False))
     assert silent.stop_reason is StopReason.STALLED  # else the case no longer shows what it is for
-    assert result.converged
-    assert result.notes
-    assert result.cost < 0.5 * result.cost_initial
     clamped = solve(stiff.with_constraints(clamp_information(stiff.constraints, 1e7)))
-    assert result.cost == pytest.approx(clamped.cost, rel=1e-3)
+    for kind in SolverKind:
+        result = solve(stiff, SolverSettings(kind=kind))
+        assert result.converged
+        assert result.notes or kind is not SolverKind.GTSAM
+        assert result.cost < 0.5 * result.cost_initial
+        assert result.cost == pytest.approx(clamped.cost, rel=1e-3)
 
 
 def test_clamping_leaves_the_rest_alone(graph: PoseGraph) -> None:
