@@ -16,19 +16,34 @@ def propagate_poses(group: Group, poses: FloatArray, known: BoolArray, constrain
     First once through the constraints in their order (for a log: the odometry chain), then breadth first over what is
     left. A part without any known pose starts at the identity in its first node.
     """
+    result, done, inverse = _prepared(group, poses, known, constraints)
+    _in_order(constraints.i, constraints.j, constraints.T_i_j, inverse, result, done)
+    return _spread(result, done, inverse, constraints)
+
+
+def spread_poses(group: Group, poses: FloatArray, known: BoolArray, constraints: Constraints) -> FloatArray:
+    """Fill the poses that are not known by composing as few constraints as can be from known ones (breadth first)."""
+    result, done, inverse = _prepared(group, poses, known, constraints)
+    return _spread(result, done, inverse, constraints)
+
+
+def _prepared(
+    group: Group, poses: FloatArray, known: BoolArray, constraints: Constraints
+) -> tuple[FloatArray, BoolArray, FloatArray]:
     result, done = np.array(poses, dtype=np.float64), np.array(known, dtype=np.bool_)
     result[~done] = np.eye(group.matrix_size)
-    c, count = constraints, len(result)
-    inverse = group.inverse(c.T_i_j)
-    ends = np.concatenate([c.i, c.j])
-    numbers = np.concatenate([np.arange(len(c)), np.arange(len(c))])
-    order = np.lexsort((numbers, ends))  # incident edges of each node in the order of the constraints
-    start = np.searchsorted(ends[order], np.arange(count + 1))
-    if count and not done.any():
+    if len(done) and not done.any():
         done[0] = True
-    _in_order(c.i, c.j, c.T_i_j, inverse, result, done)
-    _breadth_first(start, numbers[order], c.i, c.j, c.T_i_j, inverse, result, done)
-    return result
+    return result, done, group.inverse(constraints.T_i_j)
+
+
+def _spread(poses: FloatArray, done: BoolArray, inverse: FloatArray, constraints: Constraints) -> FloatArray:
+    c = constraints
+    ends, numbers = np.concatenate([c.i, c.j]), np.concatenate([np.arange(len(c)), np.arange(len(c))])
+    order = np.lexsort((numbers, ends))  # incident edges of each node in the order of the constraints
+    start = np.searchsorted(ends[order], np.arange(len(poses) + 1))
+    _breadth_first(start, numbers[order], c.i, c.j, c.T_i_j, inverse, poses, done)
+    return poses
 
 
 @kernel

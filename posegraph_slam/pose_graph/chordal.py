@@ -1,0 +1,95 @@
+"""A start that needs no start: the chordal relaxation of a pose graph, SE(2) and SE(3) by one code.
+
+Rotations first, as free matrices: min sum k |R_i R_ij - R_j|^2 is linear least squares over their entries; each is then
+projected onto the rotations (Martinec and Pajdla 2007; Carlone et al. 2015). With rotations known, translations are
+linear least squares too. Both systems have the graph's own pattern, so that one symbolic analysis serves them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.errors import GraphError
+from posegraph_slam.geometry import pose_from_rotation_translation
+from posegraph_slam.pose_graph.block_cholesky import BlockPattern, block_pattern, factorize, solve_factored
+from posegraph_slam.pose_graph.graph import PoseGraph
+
+
+def chordal_poses(graph: PoseGraph) -> FloatArray:
+    """Return poses (N, d+1, d+1) from the constraints and the poses of the fixed nodes alone.
+
+    The graph must pass `check_graph`. Rotations are weighted by the mean of their information, translations by
+    theirs in full. Raises `GraphError` where the relaxation is singular.
+    """
+    if graph.fixed.all():
+        return graph.poses
+    c, d = graph.constraints, graph.group.dimension
+    place = np.cumsum(~graph.fixed) - 1
+    inner = ~(graph.fixed[c.i] | graph.fixed[c.j])
+    pattern = block_pattern(int((~graph.fixed).sum()), place[c.i[inner]], place[c.j[inner]], d)
+    rotations = _rotations(graph, pattern)
+    return pose_from_rotation_translation(rotations, _translations(graph, pattern, rotations))
+
+
+def _blocks(graph: PoseGraph) -> tuple[slice, slice]:
+    """Return where rotation and translation stand in the tangent."""
+    p, d = graph.group.dof, graph.group.dimension
+    return (slice(2, 3), slice(0, 2)) if d == 2 else (slice(0, 3), slice(p - d, p))
+
+
+def _rotations(graph: PoseGraph, pattern: BlockPattern) -> FloatArray:
+    """Solve for X_i = R_i^T with R_ij^T X_i = X_j in the least squares sense, and project."""
+    c, d = graph.constraints, graph.group.dimension
+    turn, _ = _blocks(graph)
+    weight = np.trace(c.information[:, turn, turn], axis1=1, axis2=2) / (turn.stop - turn.start)
+    R = c.T_i_j[:, :d, :d]
+    ones = weight[:, None, None] * np.eye(d)
+    known = np.swapaxes(graph.poses[:, :d, :d], 1, 2)
+    X = _solve(graph, pattern, ones, ones, -weight[:, None, None] * R, np.zeros_like(known), known)
+    U, _, Vt = np.linalg.svd(np.swapaxes(X, 1, 2))
+    U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]
+    return np.where(graph.fixed[:, None, None], graph.poses[:, :d, :d], U @ Vt)
+
+
+def _translations(graph: PoseGraph, pattern: BlockPattern, rotations: FloatArray) -> FloatArray:
+    """Solve for t with t_j - t_i = R_i t_ij in the least squares sense."""
+    c, d = graph.constraints, graph.group.dimension
+    _, shift = _blocks(graph)
+    R = rotations[c.i]
+    W = R @ c.information[:, shift, shift] @ np.swapaxes(R, 1, 2)
+    pull = W @ (R @ c.T_i_j[:, :d, d, None])
+    right = np.zeros((len(graph), d, 1))
+    np.add.at(right, c.i, -pull)
+    np.add.at(right, c.j, pull)
+    t = _solve(graph, pattern, W, W, -W, right, graph.poses[:, :d, d, None])[..., 0]
+    return np.where(graph.fixed[:, None], graph.poses[:, :d, d], t)
+
+
+def _solve(
+    graph: PoseGraph,
+    pattern: BlockPattern,
+    at_i: FloatArray,
+    at_j: FloatArray,
+    between: FloatArray,
+    right: FloatArray,
+    known: FloatArray,
+) -> FloatArray:
+    """Solve the block system with edge blocks [[at_i, between], [between^T, at_j]] for columns (N, d, m).
+
+    Fixed nodes keep the values `known` (N, d, m) and move to the right-hand side.
+    """
+    c, free = graph.constraints, np.flatnonzero(~graph.fixed)
+    right, diagonal = np.array(right), np.zeros((len(graph), *at_i.shape[1:]))
+    np.add.at(diagonal, c.i, at_i)
+    np.add.at(diagonal, c.j, at_j)
+    to_fixed, from_fixed = graph.fixed[c.j], graph.fixed[c.i]
+    np.add.at(right, c.i[to_fixed], -between[to_fixed] @ known[c.j[to_fixed]])
+    np.add.at(right, c.j[from_fixed], -np.swapaxes(between[from_fixed], 1, 2) @ known[c.i[from_fixed]])
+    factor = factorize(pattern, diagonal[free], between[~(to_fixed | from_fixed)], 0.0)
+    if factor is None:
+        raise GraphError("pose graph", "its chordal relaxation is singular", "start from its own poses")
+    result = np.array(known)
+    columns = [solve_factored(pattern, factor, np.ascontiguousarray(right[free, :, k])) for k in range(known.shape[2])]
+    result[free] = np.stack(columns, axis=-1)
+    return result

@@ -1,0 +1,67 @@
+"""Where a solver starts: the poses given, the odometry chain, a spanning tree, or the chordal relaxation."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.errors import GraphError
+from posegraph_slam.execution import silent_progress
+from posegraph_slam.pose_graph.checks import check_graph
+from posegraph_slam.pose_graph.chordal import chordal_poses
+from posegraph_slam.pose_graph.graph import PoseGraph
+from posegraph_slam.pose_graph.initialization import propagate_poses, spread_poses
+from posegraph_slam.pose_graph.residuals import chi2
+from posegraph_slam.pose_graph.solver_settings import SolverSettings
+from posegraph_slam.pose_graph.sparse_solver import run_sparse
+
+TRIAL_ITERATIONS = 3
+"""Steps given to each start before `BEST` compares their costs: what a start is worth shows only after some."""
+
+
+class Start(StrEnum):
+    """Which poses a solver starts from."""
+
+    GIVEN = "given"
+    ODOMETRY = "odometry"
+    """Constraints composed in their order from the fixed nodes on."""
+    SPANNING_TREE = "spanning_tree"
+    """Constraints composed breadth first: the fewest from a fixed node to each other one."""
+    CHORDAL = "chordal"
+    """Rotations, then translations, by linear least squares."""
+    BEST = "best"
+    """That of the above which costs least after a few steps."""
+
+
+def starting_poses(graph: PoseGraph, start: Start) -> tuple[FloatArray, Start]:
+    """Return poses (N, d+1, d+1) to start from, and which start they are (the winner for `BEST`).
+
+    Raises `GraphError` for a graph that cannot be solved.
+    """
+    check_graph(graph)
+    if start is Start.GIVEN:
+        return graph.poses, start
+    if start is Start.ODOMETRY:
+        return propagate_poses(graph.group, graph.poses, graph.fixed, graph.constraints), start
+    if start is Start.SPANNING_TREE:
+        return spread_poses(graph.group, graph.poses, graph.fixed, graph.constraints), start
+    if start is Start.CHORDAL:
+        return chordal_poses(graph), start
+    return _best(graph)
+
+
+def _best(graph: PoseGraph) -> tuple[FloatArray, Start]:
+    settings = SolverSettings(max_iterations=TRIAL_ITERATIONS)
+    found: list[tuple[float, FloatArray, Start]] = []
+    for start in (s for s in Start if s is not Start.BEST):
+        try:
+            poses, _ = starting_poses(graph, start)
+        except GraphError:
+            continue
+        tried = run_sparse(graph.with_poses(poses), settings, silent_progress).poses
+        found.append((0.5 * float(np.sum(chi2(graph.with_poses(tried)))), tried, start))
+    cost = [entry[0] if np.isfinite(entry[0]) else np.inf for entry in found]
+    _, poses, winner = found[int(np.argmin(cost))]
+    return poses, winner
