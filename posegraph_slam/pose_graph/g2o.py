@@ -8,7 +8,6 @@ of session 0; above, the upper half is the session (`node_ids`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,17 @@ from scipy.spatial.transform import Rotation
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import InputError
-from posegraph_slam.geometry import SE2, SE3, Group, pose_from_rotation_translation, pose_from_xyt, xyt_from_pose
+from posegraph_slam.geometry import SE2, pose_from_rotation_translation, pose_from_xyt, xyt_from_pose
 from posegraph_slam.pose_graph.graph import PoseGraph
-from posegraph_slam.pose_graph.graph_file import assemble_graph, node_ids, unfold_symmetric, write_text
-from posegraph_slam.pose_graph.graph_text import RecordFormat, Records, format_records, read_records
+from posegraph_slam.pose_graph.graph_file import (
+    assemble_graph,
+    fold_information,
+    group_of,
+    node_ids,
+    unfold_information,
+    write_text,
+)
+from posegraph_slam.pose_graph.graph_text import RecordFormat, format_records, read_records
 
 FORMATS = {
     "VERTEX_SE2": RecordFormat(ids=1, reals=3),
@@ -29,8 +35,6 @@ FORMATS = {
     "FIX": RecordFormat(ids=None, reals=0),
 }
 TAGS = {"SE(2)": ("VERTEX_SE2", "EDGE_SE2"), "SE(3)": ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")}
-TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
-"""Swaps rotation-first and translation-first tangents of SE(3); its own inverse."""
 QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of |q| from 1 taken for rounding; files of four digits exist."""
 
@@ -43,7 +47,7 @@ def read_g2o(path: Path | str) -> PoseGraph:
     """
     path = Path(path)
     records = read_records(path, FORMATS)
-    group = _group_of(path, records)
+    group = group_of(path, records, TAGS)
     vertices, edges = (records[tag] for tag in TAGS[group.name])
     size = 3 if group is SE2 else 7
     constraints_T = _poses(path, edges.reals[:, :size], edges.lines)
@@ -52,7 +56,7 @@ def read_g2o(path: Path | str) -> PoseGraph:
         group,
         vertices=(vertices, _poses(path, vertices.reals, vertices.lines)),
         edges=(edges, constraints_T),
-        information=_information(group, edges.reals[:, size:]),
+        information=unfold_information(group, edges.reals[:, size:]),
         fixed=records["FIX"],
     )
 
@@ -66,21 +70,13 @@ def write_g2o(graph: PoseGraph, path: Path | str) -> None:
     path, c, ids = Path(path), graph.constraints, node_ids(graph)
     vertex, edge = TAGS[graph.group.name]
     ends = np.stack([ids[c.i], ids[c.j]], axis=1)
-    reals = np.concatenate([_reals(c.T_i_j), _information_reals(graph.group, c.information)], axis=1)
+    reals = np.concatenate([_reals(c.T_i_j), fold_information(graph.group, c.information)], axis=1)
     lines = [
         *format_records(vertex, ids[:, None], _reals(graph.poses)),
         *format_records(edge, ends, reals),
         *(f"FIX {number}" for number in ids[graph.fixed].tolist()),
     ]
     write_text(path, "\n".join(lines) + "\n")
-
-
-def _group_of(path: Path, records: Mapping[str, Records]) -> Group:
-    present = [g for g in (SE2, SE3) if any(len(records[tag].lines) for tag in TAGS[g.name])]
-    if len(present) != 1:
-        problem = "it mixes SE2 and SE3 records" if present else "it holds no pose and no edge"
-        raise InputError(path, problem, "give a file of either kind")
-    return present[0]
 
 
 def _poses(path: Path, reals: FloatArray, lines: IntArray) -> FloatArray:
@@ -104,17 +100,3 @@ def _reals(poses: FloatArray) -> FloatArray:
         return xyt_from_pose(poses)
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else np.zeros((0, 4))
     return np.concatenate([poses[:, :3, 3], quaternions], axis=1)
-
-
-def _information(group: Group, reals: FloatArray) -> FloatArray:
-    """Unfold upper triangles, row by row (n, p(p+1)/2), into information (n, p, p) in GTSAM's tangent order."""
-    matrix = unfold_symmetric(reals, group.dof)
-    return matrix if group is SE2 else matrix[:, TRANSLATION_FIRST[:, None], TRANSLATION_FIRST]
-
-
-def _information_reals(group: Group, information: FloatArray) -> FloatArray:
-    """Invert `_information`."""
-    if group is SE3:
-        information = information[:, TRANSLATION_FIRST[:, None], TRANSLATION_FIRST]
-    rows, columns = np.triu_indices(group.dof)
-    return information[:, rows, columns]

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import InputError
-from posegraph_slam.geometry import Group
+from posegraph_slam.geometry import SE2, SE3, Group
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
 from posegraph_slam.pose_graph.graph_text import Records
 from posegraph_slam.pose_graph.initialization import propagate_poses
 
+TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
+"""Where translation-first tangents of SE(3) stand in rotation-first ones."""
 SESSION_BITS = 32
 """A file knows one id a node: session * 2^32 + index, so that files of one log keep their numbers."""
 
@@ -83,13 +86,34 @@ def _rows_of(ids: IntArray, wanted: IntArray) -> IntArray:
     return np.where(ids[rows] == wanted, rows, -1)
 
 
-def unfold_symmetric(upper: FloatArray, size: int) -> FloatArray:
-    """Unfold upper triangles, row by row (n, size(size+1)/2), into symmetric matrices (n, size, size)."""
-    rows, columns = np.triu_indices(size)
-    matrix = np.zeros((len(upper), size, size))
+def group_of(path: Path, records: Mapping[str, Records], tags: Mapping[str, tuple[str, str]]) -> Group:
+    """Return the group whose tags a file's records have; `tags` maps a group's name to its vertex and edge tags."""
+    present = [g for g in (SE2, SE3) if any(len(records[tag].lines) for tag in tags[g.name])]
+    if len(present) != 1:
+        problem = "it mixes planar and spatial records" if present else "it holds no pose and no edge"
+        raise InputError(path, problem, "give a file of either kind")
+    return present[0]
+
+
+def unfold_information(group: Group, upper: FloatArray) -> FloatArray:
+    """Unfold upper triangles, row by row (n, p(p+1)/2), translation first, into information in GTSAM's order."""
+    rows, columns = _places(group)
+    matrix = np.zeros((len(upper), group.dof, group.dof))
     matrix[:, rows, columns] = upper
     matrix[:, columns, rows] = upper
     return matrix
+
+
+def fold_information(group: Group, information: FloatArray) -> FloatArray:
+    """Invert `unfold_information`."""
+    rows, columns = _places(group)
+    return information[:, rows, columns]
+
+
+def _places(group: Group) -> tuple[IntArray, IntArray]:
+    """Return where in GTSAM's order the entries of a translation-first upper triangle stand."""
+    rows, columns = np.triu_indices(group.dof)
+    return (rows, columns) if group is SE2 else (TRANSLATION_FIRST[rows], TRANSLATION_FIRST[columns])
 
 
 def write_text(path: Path, text: str) -> None:

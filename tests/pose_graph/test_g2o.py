@@ -129,7 +129,7 @@ def test_gtsam_reads_our_files_alike(graph: PoseGraph, group: Group, tmp_path: P
         ("VERTEX_SE2 20 0 0 0", r"graph.g2o:11: node 20 is given twice"),
         ("FIX 12", r"graph.g2o:11: FIX names node 12, which is not there"),
         ("FIX x", r"graph.g2o:11: value 1 of FIX is 'x'"),
-        ("VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1", "mixes SE2 and SE3"),
+        ("VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1", "mixes planar and spatial"),
     ],
 )
 def test_bad_lines_are_named(tmp_path: Path, line: str, message: str) -> None:

@@ -65,8 +65,8 @@ def test_a_solved_graph_is_said_to_be_optimal(graph: PoseGraph) -> None:
 
 
 def test_several_fixed_nodes_stay_exactly(graph_maker: Maker, group: Group) -> None:
-    graph = graph_maker(group, nodes=15, loops=8)
-    fixed = np.isin(np.arange(len(graph)), [0, 6, 14])
+    graph = graph_maker(group, nodes=9, loops=5)
+    fixed = np.isin(np.arange(len(graph)), [0, 4, 8])
     poses = shaken(graph, solve(graph).poses)
     held = PoseGraph(poses=poses, session=graph.session, index=graph.index, fixed=fixed, constraints=graph.constraints)
     result = solve(held)
