@@ -1,4 +1,4 @@
-"""Uncertainty of chosen poses and of one pose seen from another, from the linearised graph (GTSAM's Marginals).
+"""Uncertainty of poses, and of one pose seen from another, from the factored normal equations of a solved graph.
 
 Covariances are in the tangent of the right update T exp(d), in GTSAM's order, at the poses of the graph given: solve
 it first. A fixed node has covariance zero.
@@ -6,52 +6,112 @@ it first. A fixed node has covariance zero.
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import GraphError
+from posegraph_slam.pose_graph.block_cholesky import factorize
+from posegraph_slam.pose_graph.block_inverse import inverse_columns, inverse_diagonal
 from posegraph_slam.pose_graph.checks import check_graph
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
-from posegraph_slam.pose_graph.gtsam_solver import to_factor_graph, to_values
 from posegraph_slam.pose_graph.noise import symmetrised
+from posegraph_slam.pose_graph.robust import RobustSettings
+from posegraph_slam.pose_graph.sparse_solver import FreeSystem, free_system, linearize
+
+COLUMNS_AT_ONCE = 64
+"""Nodes whose columns of the covariance are solved for together: bounds memory at 64 p columns of it."""
 
 
-def marginal_covariances(graph: PoseGraph, nodes: npt.ArrayLike, *, weights: FloatArray | None = None) -> FloatArray:
-    """Return the covariances (K, p, p) of the poses at rows `nodes` (K,), in the frame of each pose.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Marginals:
+    """A graph factored at its poses, to be asked for covariances many times."""
+
+    graph: PoseGraph
+    system: FreeSystem | None
+    """None where every node is fixed."""
+    factor: FloatArray
+    place: IntArray
+    """Row (N,) of each node among the free ones; meaningless for fixed nodes."""
+
+    def covariances(self) -> FloatArray:
+        """Return the covariance (N, p, p) of every pose, in the frame of each pose."""
+        p = self.graph.group.dof
+        result = np.zeros((len(self.graph), p, p))
+        if self.system is not None:
+            result[self.system.rows] = inverse_diagonal(self.system.pattern, self.factor)
+        return symmetrised(result)
+
+    def cross_covariances(self, i: IntArray, j: IntArray) -> FloatArray:
+        """Return the covariances (K, p, p) between poses i (rows) and j (columns)."""
+        p, fixed = self.graph.group.dof, self.graph.fixed
+        result = np.zeros((len(i), p, p))
+        pairs = np.flatnonzero(~(fixed[i] | fixed[j]))
+        if self.system is None or len(pairs) == 0:
+            return result
+        transposed = len(np.unique(i[pairs])) < len(np.unique(j[pairs]))
+        rows, columns = (j[pairs], i[pairs]) if transposed else (i[pairs], j[pairs])
+        wanted, which = np.unique(columns, return_inverse=True)
+        for begin in range(0, len(wanted), COLUMNS_AT_ONCE):
+            now = np.flatnonzero((which >= begin) & (which < begin + COLUMNS_AT_ONCE))
+            part = self.place[wanted[begin : begin + COLUMNS_AT_ONCE]]
+            solved = inverse_columns(self.system.pattern, self.factor, part)
+            blocks = solved[self.place[rows[now]], :, which[now] - begin]
+            result[pairs[now]] = np.swapaxes(blocks, 1, 2) if transposed else blocks
+        return result
+
+    def relative(self, i: npt.ArrayLike, j: npt.ArrayLike) -> FloatArray:
+        """Return the covariances (K, p, p) of T_i_j for pairs of rows i, j (K,), in the frame of each j.
+
+        With d_i, d_j the updates of both poses, that of T_i_j is d_j - Ad(T_j_i) d_i (Sola et al. 2018, section IV).
+        """
+        first, second = _rows(self.graph, i), _rows(self.graph, j)
+        group, own = self.graph.group, self.covariances()
+        A = group.adjoint(group.between(self.graph.poses[second], self.graph.poses[first]))
+        mixed = A @ self.cross_covariances(first, second)
+        result = A @ own[first] @ np.swapaxes(A, 1, 2) + own[second] - mixed - np.swapaxes(mixed, 1, 2)
+        return symmetrised(np.where((first == second)[:, None, None], 0.0, result))
+
+
+def factored_marginals(graph: PoseGraph, *, weights: FloatArray | None = None) -> Marginals:
+    """Linearise and factor a graph at its poses.
 
     `weights` (E,), such as those of a robust solution, scale the information of the constraints. Raises `GraphError`
     for a graph that fails `check_graph` (no fixed node, say) or is singular at its poses.
     """
+    check_graph(graph)
+    if weights is not None:
+        graph = graph.with_constraints(scale_information(graph.constraints, weights))
+    place = np.cumsum(~graph.fixed) - 1
+    if graph.fixed.all():
+        return Marginals(graph=graph, system=None, factor=np.zeros(0), place=place)
+    system = free_system(graph)
+    linear = linearize(graph, graph.poses, system, RobustSettings())
+    factor = factorize(system.pattern, linear.diagonal, linear.off_diagonal, 0.0)
+    if factor is None:
+        raise GraphError("marginals", "the graph is singular at its poses", "check weights and information")
+    return Marginals(graph=graph, system=system, factor=factor, place=place)
+
+
+def marginal_covariances(graph: PoseGraph, nodes: npt.ArrayLike, *, weights: FloatArray | None = None) -> FloatArray:
+    """Return the covariances (K, p, p) of the poses at rows `nodes` (K,); see `factored_marginals` for the rest."""
     rows = _rows(graph, nodes)
-    marginals = _marginals(graph, weights)
-    return symmetrised(np.array([marginals.marginalCovariance(row) for row in rows]).reshape(-1, *_size(graph)))
+    return np.asarray(factored_marginals(graph, weights=weights).covariances()[rows])
 
 
 def relative_covariance(graph: PoseGraph, i: int, j: int, *, weights: FloatArray | None = None) -> FloatArray:
-    """Return the covariance (p, p) of T_i_j = T_i^-1 T_j, in the frame of node j; errors as `marginal_covariances`."""
+    """Return the covariance (p, p) of T_i_j = T_i^-1 T_j, in the frame of node j."""
     return np.asarray(relative_covariances(graph, [i], [j], weights=weights)[0])
 
 
 def relative_covariances(
     graph: PoseGraph, i: npt.ArrayLike, j: npt.ArrayLike, *, weights: FloatArray | None = None
 ) -> FloatArray:
-    """Return the covariances (K, p, p) of T_i_j for pairs of rows i, j (K,), in the frame of each j.
-
-    With d the joint update of both poses, the update of T_i_j is d_j - Ad(T_j_i) d_i (Sola et al. 2018, section IV).
-    """
+    """Return the covariances (K, p, p) of T_i_j for pairs of rows i, j (K,), in the frame of each j."""
     first, second = _rows(graph, i), _rows(graph, j)
-    marginals, p = _marginals(graph, weights), graph.group.dof
-    joint = np.zeros((len(first), 2 * p, 2 * p))
-    for k, (a, b) in enumerate(zip(first, second, strict=True)):
-        if a != b:
-            joint[k] = _joint(graph, marginals, a, b)
-    to_second = graph.group.between(graph.poses[second], graph.poses[first])
-    jacobian = np.concatenate([-graph.group.adjoint(to_second), np.broadcast_to(np.eye(p), (len(first), p, p))], axis=2)
-    return symmetrised(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
+    return factored_marginals(graph, weights=weights).relative(first, second)
 
 
 def scale_information(constraints: Constraints, weights: FloatArray) -> Constraints:
@@ -65,45 +125,9 @@ def scale_information(constraints: Constraints, weights: FloatArray) -> Constrai
     )
 
 
-def _size(graph: PoseGraph) -> tuple[int, int]:
-    return graph.group.dof, graph.group.dof
-
-
-def _rows(graph: PoseGraph, nodes: npt.ArrayLike) -> list[int]:
+def _rows(graph: PoseGraph, nodes: npt.ArrayLike) -> IntArray:
     rows = np.atleast_1d(np.asarray(nodes, dtype=np.int64))
-    if np.any((rows < 0) | (rows >= len(graph))):
-        raise GraphError(
-            "marginals", f"row {rows[(rows < 0) | (rows >= len(graph))][0]} is not one of {len(graph)} nodes"
-        )
-    return [int(row) for row in rows]
-
-
-def _marginals(graph: PoseGraph, weights: FloatArray | None) -> Any:
-    check_graph(graph)
-    if weights is not None:
-        graph = graph.with_constraints(scale_information(graph.constraints, np.maximum(weights, 1e-12)))
-    try:
-        return gtsam.Marginals(to_factor_graph(graph), to_values(graph.poses))
-    except RuntimeError as error:
-        raise GraphError(
-            "marginals", f"the graph is singular at its poses ({str(error).strip().splitlines()[0]})"
-        ) from None
-
-
-def _joint(graph: PoseGraph, marginals: Any, a: int, b: int) -> FloatArray:
-    """Return the joint covariance (2p, 2p) of two nodes, that of `a` first.
-
-    GTSAM inverts the joint information for it, which is infinite, and the result wrong, where a node is fixed.
-    """
-    p = graph.group.dof
-    result = np.zeros((2, p, 2, p))
-    if graph.fixed[a] or graph.fixed[b]:
-        for k, row in enumerate((a, b)):
-            if not graph.fixed[row]:
-                result[k, :, k] = marginals.marginalCovariance(row)
-    else:
-        joint = marginals.jointMarginalCovariance([a, b])
-        for k, row in enumerate((a, b)):
-            for m, column in enumerate((a, b)):
-                result[k, :, m] = joint.at(row, column)
-    return result.reshape(2 * p, 2 * p)
+    outside = (rows < 0) | (rows >= len(graph))
+    if np.any(outside):
+        raise GraphError("marginals", f"row {rows[outside][0]} is not one of {len(graph)} nodes")
+    return rows

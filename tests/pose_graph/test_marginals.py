@@ -1,11 +1,18 @@
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 
 from posegraph_slam.errors import GraphError
 from posegraph_slam.pose_graph.graph import PoseGraph
-from posegraph_slam.pose_graph.marginals import marginal_covariances, relative_covariance, relative_covariances
+from posegraph_slam.pose_graph.gtsam_solver import to_factor_graph, to_values
+from posegraph_slam.pose_graph.marginals import (
+    factored_marginals,
+    marginal_covariances,
+    relative_covariance,
+    relative_covariances,
+)
 from posegraph_slam.pose_graph.residuals import constraint_jacobians
 from posegraph_slam.pose_graph.solve import solve
 
@@ -75,3 +82,23 @@ def test_missing_gauge_and_bad_rows_are_named(solved: PoseGraph) -> None:
         marginal_covariances(loose, [1])
     with pytest.raises(GraphError, match="row 40 is not one of 40 nodes"):
         marginal_covariances(solved, [1, 40])
+
+
+def test_marginals_equal_gtsams(solved: PoseGraph) -> None:
+    oracle = gtsam.Marginals(to_factor_graph(solved), to_values(solved.poses))
+    nodes = np.array([1, 5, 25, 39])
+    expected = [oracle.marginalCovariance(node) for node in nodes.tolist()]
+    np.testing.assert_allclose(marginal_covariances(solved, nodes), expected, rtol=1e-6, atol=1e-12)
+
+
+def test_many_pairs_are_solved_in_pieces(solved: PoseGraph) -> None:
+    pairs = np.array([(a, b) for a in range(0, 40, 3) for b in range(40)])
+    marginals = factored_marginals(solved)
+    whole = marginals.relative(pairs[:, 0], pairs[:, 1])
+    dense = dense_covariance(solved, np.ones(len(solved.constraints)))
+    cross = marginals.cross_covariances(pairs[:, 0], pairs[:, 1])
+    np.testing.assert_allclose(cross, dense[pairs[:, 0], :, pairs[:, 1]], rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(
+        cross, np.swapaxes(marginals.cross_covariances(pairs[:, 1], pairs[:, 0]), 1, 2), atol=1e-10
+    )
+    np.testing.assert_allclose(whole[7], relative_covariance(solved, *pairs[7].tolist()))

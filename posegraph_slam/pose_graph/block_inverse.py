@@ -1,0 +1,127 @@
+"""Parts of the inverse of a factored block matrix: its diagonal blocks, and whole block columns.
+
+The diagonal comes from Takahashi's recursion on supernodes: with F the front of a supernode, J its columns and R the
+rows below, Z_RJ = -Z_RR L_RJ L_JJ^-1 and Z_JJ = L_JJ^-T L_JJ^-1 - L_JJ^-T L_RJ^T Z_RJ, from the last supernode
+to the first; Z_RR lies in the front of the parent (Erisman and Tinney 1975).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.jit import kernel
+from posegraph_slam.pose_graph.block_cholesky import BlockPattern
+
+
+def inverse_diagonal(pattern: BlockPattern, factor: FloatArray) -> FloatArray:
+    """Return the diagonal blocks (n, p, p) of the inverse of a matrix factored by `factorize`."""
+    tree = pattern.elimination
+    sizes = pattern.block * (np.diff(tree.start) + np.diff(tree.row_start))
+    blocks = np.empty((pattern.size, pattern.block, pattern.block))
+    stack = np.empty(_path_size(sizes, tree.parent))
+    _inverse_diagonal(pattern.block, tree.start, tree.row_start, tree.relative, tree.parent, pattern.factor_start,
+                      factor, pattern.largest_front, stack, blocks)  # fmt: skip
+    return np.asarray(blocks[tree.position])
+
+
+def inverse_columns(pattern: BlockPattern, factor: FloatArray, rows: IntArray) -> FloatArray:
+    """Return the block columns (n, p, K, p) of the inverse that belong to block rows `rows` (K,)."""
+    tree, p = pattern.elimination, pattern.block
+    x = np.zeros((pattern.size, p, len(rows), p))
+    for k in range(p):
+        x[tree.position[rows], k, np.arange(len(rows)), k] = 1.0
+    flat = x.reshape(pattern.size * p, len(rows) * p)
+    _substitute_many(p, tree.start, tree.row_start, tree.rows, pattern.factor_start, factor, flat)
+    return np.asarray(x[tree.position])
+
+
+@kernel
+def _path_size(sizes: IntArray, parent: IntArray) -> int:
+    """Return the most entries of all fronts between a supernode and its root."""
+    total, most = np.zeros(len(sizes), np.int64), 0
+    for node in range(len(sizes) - 1, -1, -1):
+        total[node] = sizes[node] ** 2 + (total[parent[node]] if parent[node] >= 0 else 0)
+        most = max(most, total[node])
+    return most
+
+
+@kernel
+def _inverse_diagonal(p: int, start: IntArray, row_start: IntArray, relative: IntArray, parent: IntArray,
+                      factor_start: IntArray, factor: FloatArray, largest: int, stack: FloatArray,
+                      blocks: FloatArray) -> None:  # fmt: skip
+    supernodes = len(parent)
+    offset = np.zeros(supernodes, np.int64)  # where the inverse of each front on the path begins
+    column, where = np.empty(largest), np.empty(largest, np.int64)
+    for node in range(supernodes - 1, -1, -1):
+        pivots, rest = (start[node + 1] - start[node]) * p, (row_start[node + 1] - row_start[node]) * p
+        size, above = pivots + rest, parent[node]
+        L = factor[factor_start[node] : factor_start[node + 1]].reshape(size, pivots)
+        offset[node] = 0
+        if above >= 0:
+            upper = (start[above + 1] - start[above] + row_start[above + 1] - row_start[above]) * p
+            offset[node] = offset[above] + upper * upper
+        Z = stack[offset[node] : offset[node] + size * size].reshape(size, size)
+        if above >= 0:
+            outer = stack[offset[above] : offset[above] + upper * upper].reshape(upper, upper)
+            for r in range(rest // p):
+                for a in range(p):
+                    where[r * p + a] = relative[row_start[node] + r] * p + a
+            for r in range(rest):
+                source, target = outer[where[r]], Z[pivots + r]
+                for c in range(rest):
+                    target[pivots + c] = source[where[c]]
+        # Column by column from the last pivot: all of Z below and right of it is known by then.
+        for k in range(pivots - 1, -1, -1):
+            scale = 1.0 / L[k, k]
+            for row in range(k + 1, size):
+                column[row] = L[row, k] * scale
+            for row in range(k + 1, size):
+                source, total = Z[row], 0.0
+                for m in range(k + 1, size):
+                    total -= source[m] * column[m]
+                Z[row, k] = total
+            total = scale * scale
+            for row in range(k + 1, size):
+                total -= Z[row, k] * column[row]
+                Z[k, row] = Z[row, k]
+            Z[k, k] = total
+        for b in range(start[node + 1] - start[node]):
+            for r in range(p):
+                for c in range(p):
+                    blocks[start[node] + b, r, c] = Z[b * p + r, b * p + c]
+
+
+@kernel
+def _substitute_many(p: int, start: IntArray, row_start: IntArray, rows: IntArray, factor_start: IntArray,
+                     factor: FloatArray, x: FloatArray) -> None:  # fmt: skip
+    """Solve in place for many right-hand sides x (n * p, m)."""
+    supernodes, many = len(start) - 1, x.shape[1]
+    for node in range(supernodes):
+        base, pivots = start[node] * p, (start[node + 1] - start[node]) * p
+        below = rows[row_start[node] : row_start[node + 1]]
+        L = factor[factor_start[node] : factor_start[node + 1]].reshape(pivots + len(below) * p, pivots)
+        for row in range(len(L)):
+            target = x[base + row] if row < pivots else x[below[(row - pivots) // p] * p + (row - pivots) % p]
+            for k in range(min(row, pivots)):
+                scale, source = L[row, k], x[base + k]
+                for m in range(many):
+                    target[m] -= scale * source[m]
+            if row < pivots:
+                scale = 1.0 / L[row, row]
+                for m in range(many):
+                    target[m] *= scale
+    for node in range(supernodes - 1, -1, -1):
+        base, pivots = start[node] * p, (start[node + 1] - start[node]) * p
+        below = rows[row_start[node] : row_start[node + 1]]
+        L = factor[factor_start[node] : factor_start[node + 1]].reshape(pivots + len(below) * p, pivots)
+        for row in range(len(L) - 1, -1, -1):
+            source = x[base + row] if row < pivots else x[below[(row - pivots) // p] * p + (row - pivots) % p]
+            if row < pivots:
+                scale = 1.0 / L[row, row]
+                for m in range(many):
+                    source[m] *= scale
+            for k in range(min(row, pivots)):
+                scale, target = L[row, k], x[base + k]
+                for m in range(many):
+                    target[m] -= scale * source[m]
