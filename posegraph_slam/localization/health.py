@@ -17,48 +17,67 @@ class Health(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """Of one scan at the best pose: returns in all, those that agree and those that conflict with the map.
+
+    `share` is the weight of the best hypothesis, number `hypothesis`, and `sigma_m` its spread.
+    """
+
+    hypothesis: int
+    share: float
+    sigma_m: float
+    returns: int
+    agree: int
+    conflict: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HealthState:
-    """What is remembered: the mean `agreement` of the best `hypothesis`, and the updates it is averaged over."""
+    """What is remembered of the best `hypothesis`: mean counts of agreeing and of all telling returns, and the updates."""
 
     health: Health
-    agreement: float
-    updates: int
-    hypothesis: int
+    hypothesis: int = 0
+    updates: int = 0
+    agree: float = 0.0
+    telling: float = 0.0
+
+    @property
+    def agreement(self) -> float:
+        """Share of the telling returns that agree with the map; 0 before there are any."""
+        return self.agree / self.telling if self.telling > 0 else 0.0
 
 
-def assess(
-    state: HealthState,
-    *,
-    hypothesis: int,
-    share: float,
-    sigma_m: float,
-    agree: int,
-    conflict: int,
-    settings: HealthSettings,
-) -> HealthState:
-    """Return the state after an update whose best hypothesis has weight `share` and position sigma `sigma_m`.
+def assess(state: HealthState, evidence: Evidence, settings: HealthSettings) -> HealthState:
+    """Return the state after an update.
 
     A known pose stays known while its agreement does; a new one is believed when one hypothesis has nearly all the
-    weight and has agreed for a while. The mean is that of the first updates, then an exponential one.
+    weight and has agreed for a while. A scan that lies mostly in unknown space says nothing. Averaging counts, not
+    shares, lets a scan speak in proportion to what it saw of the map: someone who walks by does not end a track.
     """
-    if hypothesis != state.hypothesis:
-        state = replace(state, hypothesis=hypothesis, agreement=0.0, updates=0)
-    if agree + conflict >= settings.evidence_min:
+    if evidence.hypothesis != state.hypothesis:
+        state = HealthState(health=state.health, hypothesis=evidence.hypothesis)
+    telling = evidence.agree + evidence.conflict
+    if telling >= settings.evidence_min and telling >= settings.evidence_share * evidence.returns:
         updates = state.updates + 1
-        now = agree / (agree + conflict)
         gain = 1 / min(updates, settings.memory_updates)
-        state = replace(state, updates=updates, agreement=state.agreement + gain * (now - state.agreement))
-    return replace(state, health=_judged(state, share, sigma_m, settings))
+        state = replace(
+            state,
+            updates=updates,
+            agree=state.agree + gain * (evidence.agree - state.agree),
+            telling=state.telling + gain * (telling - state.telling),
+        )
+    return replace(state, health=_judged(state, evidence, settings))
 
 
-def _judged(state: HealthState, share: float, sigma_m: float, settings: HealthSettings) -> Health:
-    certain = share >= settings.share_min and sigma_m <= settings.sigma_max_m
-    known = state.updates > 0
-    if known and state.agreement < settings.lost_below:
-        return Health.LOST if state.health is Health.OK or state.updates >= settings.memory_updates else state.health
+def _judged(state: HealthState, evidence: Evidence, settings: HealthSettings) -> Health:
+    if state.updates == 0:
+        return state.health
+    certain = evidence.share >= settings.share_min and evidence.sigma_m <= settings.sigma_max_m
+    if state.agreement < settings.lost_below:
+        # One scan is enough to end a track only once the mean holds: a fresh hypothesis gets its updates first.
+        return Health.LOST if state.updates >= settings.updates_min else state.health
     if state.health is Health.OK:
         return Health.OK if certain else Health.AMBIGUOUS
-    believed = state.updates >= settings.updates_min and state.agreement >= settings.found_above
-    if certain and believed:
-        return Health.OK
-    return Health.AMBIGUOUS if known and state.agreement >= settings.found_above else state.health
+    if state.agreement < settings.found_above:
+        return state.health
+    return Health.OK if certain and state.updates >= settings.updates_min else Health.AMBIGUOUS

@@ -12,9 +12,9 @@ from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt, wrap_angle, xyt_from_pose
 from posegraph_slam.localization.beam_model import add_log_likelihoods, agreement, refine
 from posegraph_slam.localization.global_search import SearchStack, build_search_stack, find_places
-from posegraph_slam.localization.health import Health, HealthState, assess
+from posegraph_slam.localization.health import Evidence, Health, HealthState, assess
 from posegraph_slam.localization.map_field import MapField, build_map_field
-from posegraph_slam.localization.motion import propagate
+from posegraph_slam.localization.motion import propagate, step_sigmas
 from posegraph_slam.localization.particles import Particles, around, hypothesis_weights, joined, merged, moments
 from posegraph_slam.localization.resampling import effective_number, needed_number, occupied_bins, resample
 from posegraph_slam.localization.scan_points import ScanPoints, scan_points
@@ -38,7 +38,8 @@ class PreparedMap:
 class FilterState:
     """Everything the filter carries from scan to scan; poses are in the grid frame of the map.
 
-    `recent` are the last scans that weighed the particles, each with the robot's odometry pose (3,) at it.
+    `anchor` is the last pose that was known, moved on by odometry since, and its covariance; it is what a lost robot
+    falls back to. `recent` are the last scans that weighed the particles, each with the robot's odometry pose (3,) at it.
     """
 
     particles: Particles
@@ -47,6 +48,7 @@ class FilterState:
     updated_at: FloatArray | None
     updates_since_search: int
     next_hypothesis: int
+    anchor: tuple[FloatArray, FloatArray] | None
     recent: tuple[tuple[FloatArray, ScanPoints], ...]
 
 
@@ -145,7 +147,7 @@ def initial_state(
 ) -> FilterState:
     """Return particles about `start` (map frame), or none yet: the first scan then searches the map."""
     sigmas = np.array([settings.start_sigma_m, settings.start_sigma_m, settings.start_sigma_rad])
-    health = HealthState(health=Health.LOST if start is None else Health.OK, agreement=0.0, updates=0, hypothesis=0)
+    health = HealthState(health=Health.LOST if start is None else Health.OK)
     pose = np.zeros(3) if start is None else known.field.to_grid(start)
     number = settings.number.minimum if start is None else settings.number.maximum
     return FilterState(
@@ -155,6 +157,7 @@ def initial_state(
         updated_at=None,
         updates_since_search=settings.search.every if start is None else 0,
         next_hypothesis=1,
+        anchor=None if start is None else (pose, np.diag(sigmas**2)),
         recent=(),
     )
 
@@ -167,7 +170,10 @@ def predict(
     if not increment.any():
         return state
     poses = propagate(state.particles.poses, increment, settings.noise, rng)
-    return replace(state, particles=state.particles.with_poses(poses), odometry=np.asarray(odometry))
+    anchor = None if state.anchor is None else _moved_on(state.anchor, increment, settings)
+    return replace(
+        state, particles=state.particles.with_poses(poses), odometry=np.asarray(odometry), anchor=anchor
+    )
 
 
 def update(
@@ -182,7 +188,7 @@ def update(
     The estimate is made at every scan: the mean of the best hypothesis, refined against the lines of the map.
     """
     if not _due(state, settings) or len(scan.points) == 0:
-        return state, estimate(state, known, scan, settings)
+        return _reported(state, estimate(state, known, scan, settings))
     state = _weighed(state, known, scan, settings)
     state = _remember(state, scan, settings)
     if state.health.health is not Health.OK and state.updates_since_search >= settings.search.every:
@@ -193,12 +199,12 @@ def update(
         scan.points, scan.sensor, found.pose, settings.health.agreement_m, field.kind, field.distance_m,
         field.geometry.resolution_m,
     )  # fmt: skip
-    before = state.health.health
-    health = assess(
-        state.health, hypothesis=found.hypothesis, share=found.share, sigma_m=found.sigma_m, agree=agree,
-        conflict=conflict, settings=settings.health,
+    evidence = Evidence(
+        hypothesis=found.hypothesis, share=found.share, sigma_m=found.sigma_m, returns=len(scan.points), agree=agree,
+        conflict=conflict,
     )  # fmt: skip
-    newly_lost = before is Health.OK and health.health is not Health.OK
+    health = assess(state.health, evidence, settings.health)
+    newly_lost = state.health.health is Health.OK and health.health is not Health.OK
     state = replace(
         state,
         health=health,
@@ -206,7 +212,16 @@ def update(
         recent=state.recent[-3:] if newly_lost else state.recent,
         updates_since_search=settings.search.every if newly_lost else state.updates_since_search + 1,
     )
-    return _resampled(state, found, settings, rng), found
+    return _reported(_resampled(state, found, settings, rng), found)
+
+
+def _reported(state: FilterState, found: Estimate) -> tuple[FilterState, Estimate]:
+    """Keep a known pose as the anchor; while none is known, report the anchor if there ever was one."""
+    if state.health.health is Health.OK:
+        return replace(state, anchor=(found.pose, found.covariance)), found
+    if state.anchor is None:
+        return state, found
+    return state, replace(found, pose=state.anchor[0], covariance=state.anchor[1])
 
 
 def estimate(
@@ -248,6 +263,8 @@ def recover(
     """Search the map for the last scans together, and put a share of the particles on the places found."""
     points = _recent_points(state, settings)
     places, _ = find_places(known.stack, points, settings.search)
+    if state.anchor is not None:
+        places = np.concatenate([state.anchor[0][None], places])
     state = replace(state, updates_since_search=0)
     if len(places) == 0:
         return state
@@ -275,6 +292,17 @@ def recover(
     old = old.with_log_weights(np.full(len(old), np.log((1 - share) / len(old))))
     particles = merged(joined([old, *parts]), settings.search.separation_m, settings.search.separation_rad)
     return replace(state, particles=particles, next_hypothesis=state.next_hypothesis + len(places))
+
+
+def _moved_on(
+    anchor: tuple[FloatArray, FloatArray], increment: FloatArray, settings: LocalizationSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Move a pose and its covariance on by an odometry step."""
+    sigma = step_sigmas(increment, settings.noise)
+    step = pose_from_xyt(increment)
+    back = SE2.adjoint(SE2.inverse(step))
+    pose = xyt_from_pose(pose_from_xyt(anchor[0]) @ step)
+    return pose, back @ anchor[1] @ back.T + np.diag([sigma[0] ** 2, sigma[0] ** 2, sigma[1] ** 2])
 
 
 def _due(state: FilterState, settings: LocalizationSettings) -> bool:

@@ -114,14 +114,16 @@ class HealthSettings(Settings):
 
     agreement_m: float = Field(default=0.25, gt=0)
     """A return this near to an obstacle agrees with the map; one in known free space, or behind a wall, conflicts."""
-    lost_below: float = Field(default=0.55, gt=0, lt=1)
+    lost_below: float = Field(default=0.45, gt=0, lt=1)
     """Mean agreement below which the pose is lost,"""
-    found_above: float = Field(default=0.7, gt=0, lt=1)
+    found_above: float = Field(default=0.65, gt=0, lt=1)
     """and above which a new one is believed."""
-    memory_updates: float = Field(default=4.0, ge=1)
+    memory_updates: float = Field(default=10.0, ge=1)
     """Updates over which the agreement is averaged."""
     evidence_min: int = Field(default=10, ge=1)
-    """A scan with fewer returns in the known part of the map says nothing."""
+    """A scan with fewer returns in the known part of the map says nothing,"""
+    evidence_share: float = Field(default=0.3, ge=0, le=1)
+    """and neither does one of which this share lies there."""
     share_min: float = Field(default=0.9, gt=0.5, le=1)
     """Weight of the best hypothesis below which the pose is ambiguous."""
     sigma_max_m: float = Field(default=0.5, gt=0)
@@ -139,11 +141,20 @@ class HealthSettings(Settings):
 class LocalizationSettings(Settings):
     """Localisation in a known map."""
 
-    noise: MotionNoise = MotionNoise()
+    propagation: Literal["scan_matching", "odometry"] = "scan_matching"
+    """The motion that moves the particles: of scans matched to the ones before them, or of the odometry itself."""
+    matched_noise: MotionNoise = MotionNoise(
+        translation_per_sqrt_m=0.01, translation_per_sqrt_rad=0.005, rotation_per_sqrt_rad=0.02, rotation_per_sqrt_m=0.003
+    )
+    """Noise of the motion by scan matching, good to about 1 %,"""
+    odometry_noise: MotionNoise = MotionNoise(
+        translation_per_sqrt_m=0.06, translation_per_sqrt_rad=0.03, rotation_per_sqrt_rad=0.15, rotation_per_sqrt_m=0.02
+    )
+    """and of the motion by odometry."""
     number: ParticleNumberSettings = ParticleNumberSettings()
     resampling: ResamplingSettings = ResamplingSettings()
     beam_model: BeamModelSettings = BeamModelSettings()
-    match: BeamMatchSettings = BeamMatchSettings(gate_start_m=0.4, robust_start_m=0.2, sigma_m=0.15)
+    match: BeamMatchSettings = BeamMatchSettings(gate_start_m=0.4, robust_start_m=0.2, sigma_m=0.2)
     """Refinement of the mean against lines of the map; its sigma allows for walls that err together."""
     search: GlobalSearchSettings = GlobalSearchSettings()
     health: HealthSettings = HealthSettings()
@@ -163,3 +174,8 @@ class LocalizationSettings(Settings):
     """Position sigma of the map itself, added to that of the estimate,"""
     covariance_floor_rad: float = Field(default=0.003, gt=0)
     """and its heading sigma."""
+
+    @property
+    def noise(self) -> MotionNoise:
+        """Noise of the chosen propagation."""
+        return self.matched_noise if self.propagation == "scan_matching" else self.odometry_noise
