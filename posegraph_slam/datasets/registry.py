@@ -63,6 +63,11 @@ BUILT_IN = (
         "laser log of the CARMEN robot navigation toolkit (FLASER, RLASER, ROBOTLASER1, ODOM, PARAM)",
         "a text file .clf, .log or .txt, or one of them compressed as .gz",
     ),
+    _built_in(
+        "imu_vicon",
+        "hand-held IMU board, raw ADC counts, with motion-capture truth where it is known (ESE650, ECE276A)",
+        "an .npz file with imu_raw and imu_stamps_s and, when present, vicon_rotation and vicon_stamps_s",
+    ),
 )
 
 

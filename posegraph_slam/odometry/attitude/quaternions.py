@@ -1,4 +1,4 @@
-"""Unit quaternions [w, x, y, z] in kernels: product, exponential, logarithm, gravity direction, mean on the manifold."""
+"""Unit quaternions [w, x, y, z] in kernels: turn, difference, vertical direction, mean on the manifold."""
 
 from __future__ import annotations
 
@@ -16,17 +16,8 @@ MEAN_TOLERANCE_RAD = 1e-9
 
 
 @kernel
-def multiply(a, b, out):  # type: ignore[no-untyped-def]
-    """Write the product a b (4,) into `out`, which may be neither a nor b."""
-    out[0] = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
-    out[1] = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
-    out[2] = a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1]
-    out[3] = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]
-
-
-@kernel
-def turn(q, x, y, z, out):  # type: ignore[no-untyped-def]
-    """Write q exp([x, y, z]) (4,), normalised, into `out`, which may be q: a turn by a rotation vector of the body."""
+def exponential(x, y, z):  # type: ignore[no-untyped-def]
+    """Return w, x, y, z of the unit quaternion that turns by the rotation vector [x, y, z]."""
     half2 = 0.25 * (x * x + y * y + z * z)
     # Below a half-angle of 1e-4 the series of sin(h)/h and cos(h) leave less than 1e-18.
     if half2 < 1e-8:
@@ -34,22 +25,41 @@ def turn(q, x, y, z, out):  # type: ignore[no-untyped-def]
     else:
         h = math.sqrt(half2)
         s, c = 0.5 * math.sin(h) / h, math.cos(h)
-    x, y, z = s * x, s * y, s * z
-    w0 = q[0] * c - q[1] * x - q[2] * y - q[3] * z
-    w1 = q[0] * x + q[1] * c + q[2] * z - q[3] * y
-    w2 = q[0] * y - q[1] * z + q[2] * c + q[3] * x
-    w3 = q[0] * z + q[1] * y - q[2] * x + q[3] * c
-    scale = 1.0 / math.sqrt(w0 * w0 + w1 * w1 + w2 * w2 + w3 * w3)
-    out[0], out[1], out[2], out[3] = w0 * scale, w1 * scale, w2 * scale, w3 * scale
+    return c, s * x, s * y, s * z
 
 
 @kernel
-def difference(a, b, out):  # type: ignore[no-untyped-def]
-    """Write the rotation vector (3,) of a^-1 b, at most pi long, into `out`."""
+def store_product(a0, a1, a2, a3, b0, b1, b2, b3, out):  # type: ignore[no-untyped-def]
+    """Write the normalised product a b into `out` (4,)."""
+    w = a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3
+    x = a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2
+    y = a0 * b2 - a1 * b3 + a2 * b0 + a3 * b1
+    z = a0 * b3 + a1 * b2 - a2 * b1 + a3 * b0
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    out[0], out[1], out[2], out[3] = w * scale, x * scale, y * scale, z * scale
+
+
+@kernel
+def turn_in_body(q, x, y, z, out):  # type: ignore[no-untyped-def]
+    """Write q exp([x, y, z]) into `out` (4,), which may be q."""
+    w, x, y, z = exponential(x, y, z)
+    store_product(q[0], q[1], q[2], q[3], w, x, y, z, out)
+
+
+@kernel
+def turn_in_world(q, x, y, z, out):  # type: ignore[no-untyped-def]
+    """Write exp([x, y, z]) q into `out` (4,), which may be q."""
+    w, x, y, z = exponential(x, y, z)
+    store_product(w, x, y, z, q[0], q[1], q[2], q[3], out)
+
+
+@kernel
+def world_difference(a, b, out):  # type: ignore[no-untyped-def]
+    """Write the rotation vector (3,) of b a^-1, at most pi long, into `out`."""
     w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-    x = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
-    y = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
-    z = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
+    x = a[0] * b[1] - a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
+    y = a[0] * b[2] - a[1] * b[3] - a[2] * b[0] + a[3] * b[1]
+    z = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] - a[3] * b[0]
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     s = math.sqrt(x * x + y * y + z * z)
@@ -67,7 +77,7 @@ def up_in_body(q, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def mean_quaternion(points, mean, errors):  # type: ignore[no-untyped-def]
-    """Move `mean` (4,) to the mean of `points` (n, 4), and write their rotation vectors (n, 3) from it into `errors`.
+    """Move `mean` (4,) to the mean of `points` (n, 4), and write their turns (n, 3) from it in the world into `errors`.
 
     Gradient descent on the manifold: turn by the mean error vector until it vanishes (Kraft 2003, section 3.4).
     """
@@ -75,13 +85,13 @@ def mean_quaternion(points, mean, errors):  # type: ignore[no-untyped-def]
     for _ in range(MEAN_ITERATIONS):
         x = y = z = 0.0
         for i in range(n):
-            difference(mean, points[i], errors[i])
+            world_difference(mean, points[i], errors[i])
             x, y, z = x + errors[i, 0], y + errors[i, 1], z + errors[i, 2]
         if math.sqrt(x * x + y * y + z * z) < n * MEAN_TOLERANCE_RAD:
             return
-        turn(mean, x / n, y / n, z / n, mean)
+        turn_in_world(mean, x / n, y / n, z / n, mean)
     for i in range(n):
-        difference(mean, points[i], errors[i])
+        world_difference(mean, points[i], errors[i])
 
 
 def wxyz_from_rotation(R: FloatArray) -> FloatArray:

@@ -1,7 +1,9 @@
 """The numeric core of the quaternion UKF: one prediction, one update, and a whole stream, in kernels.
 
-The error state is [turn of the body (3), gyro bias (3)]: q = q_mean exp(turn), acting on the right. The twelve sigma
-points are the columns of +-sqrt(6 P), equally weighted and without a centre (Kraft 2003, eq. 35-37).
+The error state is [turn in the world (3), gyro bias (3)]: q = exp(turn) q_mean. The twelve sigma points are the
+columns of +-sqrt(6 P), equally weighted and without a centre (Kraft 2003, eq. 35-37). Kraft turns in the body; in the
+world the heading, which gravity cannot show, is always the third component, so that no correction of the tilt turns
+the variance of the heading into one of the tilt. With turns in the body a correction by d rad leaks a share d of it.
 """
 
 from __future__ import annotations
@@ -11,7 +13,12 @@ import math
 import numpy as np
 
 from posegraph_slam.jit import kernel
-from posegraph_slam.odometry.attitude.quaternions import mean_quaternion, turn, up_in_body
+from posegraph_slam.odometry.attitude.quaternions import (
+    mean_quaternion,
+    turn_in_body,
+    turn_in_world,
+    up_in_body,
+)
 
 STATE = 6
 POINTS = 2 * STATE
@@ -36,25 +43,34 @@ def cholesky(P, L):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def predict_core(q, bias, P, omega, dt, gyro_density, bias_density, L, points, errors):  # type: ignore[no-untyped-def]
+def predict_core(q, bias, P, omega, dt, noise, L, points, errors):  # type: ignore[no-untyped-def]
     """Advance q (4,), bias (3,) and P (6, 6) in place by `dt` seconds at the measured rate `omega` (3,).
 
-    `gyro_density` is rad/sqrt(s) and `bias_density` rad/s/sqrt(s). L (6, 6), points (12, 4), errors (12, 6): workspace.
+    `noise` holds the gyro's in rad/sqrt(s) and rad/sqrt(rad), the bias walk in rad/s/sqrt(s), and what replaces the
+    first where `omega` is not finite: the body is then taken to rest. L (6, 6), points (12, 4), errors (12, 6) are
+    workspace.
     """
+    x, y, z = omega[0] - bias[0], omega[1] - bias[1], omega[2] - bias[2]
+    rate = math.sqrt(x * x + y * y + z * z)
+    known = math.isfinite(rate)
+    variance = noise[0] ** 2 + noise[1] ** 2 * rate if known else noise[3] ** 2
     for k in range(3):
-        P[k, k] += gyro_density * gyro_density * dt
-        P[k + 3, k + 3] += bias_density * bias_density * dt
+        P[k, k] += variance * dt
+        P[k + 3, k + 3] += noise[2] ** 2 * dt
     cholesky(P, L)
     spread = math.sqrt(float(STATE))
     for k in range(STATE):
         for side in range(2):
             i, s = 2 * k + side, spread if side == 0 else -spread
-            turn(q, s * L[0, k], s * L[1, k], s * L[2, k], points[i])
+            turn_in_world(q, s * L[0, k], s * L[1, k], s * L[2, k], points[i])
             for m in range(3):
                 errors[i, 3 + m] = s * L[3 + m, k]
-            x, y, z = bias[0] + errors[i, 3], bias[1] + errors[i, 4], bias[2] + errors[i, 5]
-            turn(points[i], (omega[0] - x) * dt, (omega[1] - y) * dt, (omega[2] - z) * dt, points[i])
-    turn(q, (omega[0] - bias[0]) * dt, (omega[1] - bias[1]) * dt, (omega[2] - bias[2]) * dt, q)
+            if known:
+                turn_in_body(
+                    points[i], (x - errors[i, 3]) * dt, (y - errors[i, 4]) * dt, (z - errors[i, 5]) * dt, points[i]
+                )
+    if known:
+        turn_in_body(q, x * dt, y * dt, z * dt, q)
     mean_quaternion(points, q, errors[:, :3])
     for a in range(STATE):
         for b in range(a + 1):
@@ -92,7 +108,7 @@ def update_core(q, bias, P, up, sigma, L, points, errors):  # type: ignore[no-un
             i, s = 2 * k + side, spread if side == 0 else -spread
             for m in range(STATE):
                 errors[i, m] = s * L[m, k]
-            turn(q, errors[i, 0], errors[i, 1], errors[i, 2], points[i])
+            turn_in_world(q, errors[i, 0], errors[i, 1], errors[i, 2], points[i])
             up_in_body(points[i], seen[i])
             for m in range(3):
                 mean[m] += seen[i, m] / POINTS
@@ -117,27 +133,31 @@ def update_core(q, bias, P, up, sigma, L, points, errors):  # type: ignore[no-un
             for m in range(3):
                 total -= gain[a, m] * cross[b, m]
             P[a, b] = P[b, a] = total
-    turn(q, step[0], step[1], step[2], q)
+    turn_in_world(q, step[0], step[1], step[2], q)
     for m in range(3):
         bias[m] += step[3 + m]
 
 
 @kernel
-def accelerometer_sigma(accel, rate, gravity, noise):  # type: ignore[no-untyped-def]
-    """Return the sigma in rad with which `accel` (3,) shows the vertical, or -1 where the motion forbids it.
+def correct(q, bias, P, accel, noise, L, points, errors):  # type: ignore[no-untyped-def]
+    """Apply `update_core` with the direction of `accel` (3,) where the motion allows it, and tell whether it did.
 
-    `noise` holds sigma at rest, growth with the relative excess of |accel| over `gravity`, growth with the turn rate
-    (rad per rad/s), and the largest excess that is believed.
+    `noise` holds gravity, sigma where |accel| is gravity, its growth with the relative excess, and the largest excess
+    that is believed. Values that are not finite are not believed.
     """
-    size = math.sqrt(accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2])
-    excess = abs(size / gravity - 1.0)
-    if not excess <= noise[3]:
-        return -1.0
-    return math.sqrt(noise[0] ** 2 + (noise[1] * excess) ** 2 + (noise[2] * rate) ** 2)
+    size = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
+    excess = abs(size / noise[0] - 1.0)
+    if not excess <= noise[3] or size == 0.0:
+        return False
+    up = np.empty(3)
+    for m in range(3):
+        up[m] = accel[m] / size
+    update_core(q, bias, P, up, math.sqrt(noise[1] ** 2 + (noise[2] * excess) ** 2), L, points, errors)
+    return True
 
 
 @kernel
-def filter_stream(dt, omega, accel, gravity, densities, noise, q, bias, P):  # type: ignore[no-untyped-def]
+def filter_stream(dt, omega, accel, gyro_noise, accel_noise, q, bias, P):  # type: ignore[no-untyped-def]
     """Run over a stream: `omega` (N, 3) holds the rate over the step of `dt` (N,) that ends at `accel` (N, 3).
 
     q, bias and P start the filter and are changed. Returns quaternions (N, 4), biases (N, 3), covariances (N, 6, 6) and
@@ -146,24 +166,10 @@ def filter_stream(dt, omega, accel, gravity, densities, noise, q, bias, P):  # t
     n = len(dt)
     quaternions, biases, covariances = np.empty((n, 4)), np.empty((n, 3)), np.empty((n, STATE, STATE))
     used = np.zeros(n, np.bool_)
-    L, points, errors, up = np.zeros((STATE, STATE)), np.empty((POINTS, 4)), np.empty((POINTS, STATE)), np.empty(3)
+    L, points, errors = np.zeros((STATE, STATE)), np.empty((POINTS, 4)), np.empty((POINTS, STATE))
     for k in range(n):
         if dt[k] > 0.0:
-            predict_core(q, bias, P, omega[k], dt[k], densities[0], densities[1], L, points, errors)
-        used[k] = correct(q, bias, P, accel[k], omega[k], gravity, noise, L, points, errors, up)
+            predict_core(q, bias, P, omega[k], dt[k], gyro_noise, L, points, errors)
+        used[k] = correct(q, bias, P, accel[k], accel_noise, L, points, errors)
         quaternions[k], biases[k], covariances[k] = q, bias, P
     return quaternions, biases, covariances, used
-
-
-@kernel
-def correct(q, bias, P, accel, omega, gravity, noise, L, points, errors, up):  # type: ignore[no-untyped-def]
-    """Apply `update_core` where `accelerometer_sigma` allows it, and tell whether it did."""
-    x, y, z = omega[0] - bias[0], omega[1] - bias[1], omega[2] - bias[2]
-    sigma = accelerometer_sigma(accel, math.sqrt(x * x + y * y + z * z), gravity, noise)
-    if sigma < 0.0:
-        return False
-    size = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
-    for m in range(3):
-        up[m] = accel[m] / size
-    update_core(q, bias, P, up, sigma, L, points, errors)
-    return True
