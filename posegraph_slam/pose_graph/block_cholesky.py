@@ -172,19 +172,19 @@ def _inverse_lower(front: FloatArray, begin: int, width: int, inverse: FloatArra
 
 
 @kernel
-def _subtract_rows(target: FloatArray, scale: FloatArray, first: int, rows: FloatArray, low: int) -> None:
-    """Do target -= scale @ rows[first:first+len(scale), low:low+len(target)], four rows a pass."""
+def _subtract_rows(target: FloatArray, scale: FloatArray, rows: FloatArray, low: int) -> None:
+    """Do target -= scale @ rows[:len(scale), low:low+len(target)], four rows a pass."""
     count, high = len(scale), low + len(target)
     k = 0
     while k + 4 <= count:
         a, b, c, d = scale[k], scale[k + 1], scale[k + 2], scale[k + 3]
-        p, q = rows[first + k][low:high], rows[first + k + 1][low:high]
-        r, s = rows[first + k + 2][low:high], rows[first + k + 3][low:high]
+        p, q = rows[k][low:high], rows[k + 1][low:high]
+        r, s = rows[k + 2][low:high], rows[k + 3][low:high]
         for m in range(len(target)):
             target[m] -= (a * p[m] + b * q[m]) + (c * r[m] + d * s[m])
         k += 4
     while k < count:
-        a, p = scale[k], rows[first + k][low:high]
+        a, p = scale[k], rows[k][low:high]
         for m in range(len(target)):
             target[m] -= a * p[m]
         k += 1
@@ -216,7 +216,9 @@ def _eliminate(front: FloatArray, size: int, pivots: int, column: FloatArray, me
         for k in range(width):
             for m in range(k + 1):
                 scale[m] = -inverse[k, m]
-            _subtract_rows(panel[k], scale[: k + 1], 0, raw, 0)
+            _subtract_rows(
+                panel[k], scale[: k + 1], raw, np.int64(0)
+            )  # typed: a literal 0 would compile a second version
         for row in range(height):
             target = front[end + row, begin:end]
             for k in range(width):
@@ -226,7 +228,7 @@ def _eliminate(front: FloatArray, size: int, pivots: int, column: FloatArray, me
                 for k in range(width):
                     scale[k] = panel[k, row]
                 reach = min(row + 1, low + STRIP)
-                _subtract_rows(front[end + row, end + low : end + reach], scale[:width], 0, panel, low)
+                _subtract_rows(front[end + row, end + low : end + reach], scale[:width], panel, low)
     return True
 
 

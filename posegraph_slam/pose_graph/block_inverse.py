@@ -76,15 +76,17 @@ def _inverse_diagonal(p: int, start: IntArray, row_start: IntArray, relative: In
             scale = 1.0 / L[k, k]
             for row in range(k + 1, size):
                 column[row] = L[row, k] * scale
-            for row in range(k + 1, size):
-                source, total = Z[row], 0.0
-                for m in range(k + 1, size):
-                    total -= source[m] * column[m]
-                Z[row, k] = total
+            result, count = Z[k, k + 1 : size], size - k - 1
+            for m in range(count):
+                result[m] = 0.0
+            for row in range(k + 1, size):  # Z is symmetric: sums of its rows, which LLVM vectorises
+                weight, source = column[row], Z[row, k + 1 : size]
+                for m in range(count):
+                    result[m] -= weight * source[m]
             total = scale * scale
-            for row in range(k + 1, size):
-                total -= Z[row, k] * column[row]
-                Z[k, row] = Z[row, k]
+            for m in range(count):
+                total -= result[m] * column[k + 1 + m]
+                Z[k + 1 + m, k] = result[m]
             Z[k, k] = total
         for b in range(start[node + 1] - start[node]):
             for r in range(p):
