@@ -81,6 +81,7 @@ def revisits(result: OptimizationResult, true_poses: FloatArray) -> tuple[int, i
 
 def run_one(name: str, size: float, seed: int, overrides: Sequence[str], folder: Path | None) -> dict[str, Any]:
     """Simulate a log, optimise it, and return what came of it; with a folder the log goes through its files."""
+    floor = peak_memory_mib()
     simulated = build(name, size=size, seed=seed)
     log = read(simulated.write(folder)) if folder else simulated.robot_log()
     true_poses = simulated.truth().poses
@@ -113,6 +114,8 @@ def run_one(name: str, size: float, seed: int, overrides: Sequence[str], folder:
         "cpu_s": round(cpu, 2),
         "stages_s": {stage: round(seconds, 2) for stage, seconds in result.stages_s.items()},
         "peak_mib": round(peak_memory_mib(), 1),
+        "floor_mib": round(floor, 1),
+        "log_mib": round(simulated.ranges_m.nbytes / 2**20, 1),
         "remarks": list(result.remarks),
     }
 
