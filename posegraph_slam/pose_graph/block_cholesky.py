@@ -216,9 +216,7 @@ def _eliminate(front: FloatArray, size: int, pivots: int, column: FloatArray, me
         for k in range(width):
             for m in range(k + 1):
                 scale[m] = -inverse[k, m]
-            _subtract_rows(
-                panel[k], scale[: k + 1], raw, np.int64(0)
-            )  # typed: a literal 0 would compile a second version
+            _subtract_rows(panel[k], scale[: k + 1], raw, 0 * begin)  # a literal 0 would compile a second version
         for row in range(height):
             target = front[end + row, begin:end]
             for k in range(width):
