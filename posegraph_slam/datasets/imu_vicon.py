@@ -21,14 +21,14 @@ ORTHONORMAL_TOLERANCE = 1e-3
 
 
 def detects(path: Path) -> bool:
-    """Tell whether `path` is an .npz archive with the field `imu_raw`."""
+    """Tell whether `path` is an .npz archive with the field `imu_raw`, or a broken one, which `read` explains."""
+    if path.suffix != ".npz" or not path.is_file():
+        return False
     try:
-        if path.suffix != ".npz" or not path.is_file():
-            return False
         with zipfile.ZipFile(path) as archive:
             return "imu_raw.npy" in archive.namelist()
     except (OSError, zipfile.BadZipFile):
-        return False
+        return True
 
 
 def read(path: str | Path) -> RobotLog:
@@ -51,8 +51,9 @@ def _truth(archive: Archive) -> Trajectory:
     if R.shape != (3, 3, len(stamps)):
         raise InputError(archive.path, f"field 'vicon_rotation' has shape {R.shape}", f"expected (3, 3, {len(stamps)})")
     R = np.moveaxis(R, 2, 0)
-    bad = ~(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHONORMAL_TOLERANCE)
-    bad |= ~(np.linalg.det(R) > 0)
+    with np.errstate(invalid="ignore"):
+        bad = ~(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHONORMAL_TOLERANCE)
+        bad |= ~(np.linalg.det(R) > 0)
     if bad.any():
         raise InputError(archive.path, f"field 'vicon_rotation' holds no rotation at index {int(np.argmax(bad))}")
     poses = pose_from_rotation_translation(R, np.zeros((len(R), 3)))

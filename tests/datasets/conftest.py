@@ -95,19 +95,33 @@ def write_carmen(path: Path, scans: int = 30) -> Path:
     return write_lines(path, lines)
 
 
+def write_imu_vicon(path: Path, samples: int = 300) -> Path:
+    """Write a run of raw IMU counts at rest, with its truth."""
+    stamps = 1.3e9 + 0.01 * np.arange(samples)
+    counts = np.tile(np.array([[511], [501], [605], [370], [374], [375]], dtype=np.uint16), (1, samples))
+    R = np.repeat(np.eye(3)[:, :, None], samples, axis=2)
+    np.savez(path, imu_raw=counts, imu_stamps_s=stamps, vicon_rotation=R, vicon_stamps_s=stamps)
+    return path
+
+
 def build(name: str, folder: Path) -> Path:
     """Write a small log of the format called `name`."""
     folder.mkdir(parents=True, exist_ok=True)
     return {
         "ece276a": lambda: write_ece276a(folder / "run"),
         "carmen": lambda: write_carmen(folder / "log.clf"),
+        "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
     }[name]()
 
 
 def build_truncated(name: str, folder: Path) -> tuple[Path, Path]:
     """Write a log whose last bytes are missing; return its path and the file that the error has to name."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = write_ece276a(folder / "run") if name == "ece276a" else write_carmen(folder / "log.clf.gz")
+    path = {
+        "ece276a": lambda: write_ece276a(folder / "run"),
+        "carmen": lambda: write_carmen(folder / "log.clf.gz"),
+        "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
+    }[name]()
     file = path / "Hokuyo7.npz" if path.is_dir() else path
     file.write_bytes(file.read_bytes()[:-100])
     return path, file

@@ -15,7 +15,8 @@ class AttitudeSettings(Settings):
     """Noise of gyro and accelerometer as the filter believes it, and how the start is recognised.
 
     The accelerometer shows the vertical only as far as the body does not accelerate: its sigma is that of unmodelled
-    motion (0.1 g tilts it by 0.1 rad), which dwarfs the sensor's own 0.005 rad, and lasts longer than one sample.
+    motion (0.1 g tilts it by 0.1 rad), which dwarfs the sensor's own 0.005 rad, and lasts longer than one sample. The
+    size |a| shows only the vertical part of that motion: where it is off by 0.02, the direction may be by far more.
     """
 
     gyro_noise_rad_per_sqrt_s: float = Field(default=0.005, gt=0, description="rad of sigma after 1 s, white noise")
@@ -30,7 +31,7 @@ class AttitudeSettings(Settings):
     unknown_bias_sigma_rad_s: float = Field(default=0.02, gt=0, description="sigma of the bias without a still start")
     accelerometer_sigma_rad: float = Field(default=0.1, gt=0, description="sigma of the vertical where |a| is g")
     accelerometer_excess_factor: float = Field(
-        default=1.0, ge=0, description="growth of that sigma with | |a|/g - 1 |, added in squares"
+        default=5.0, ge=0, description="growth of that sigma with | |a|/g - 1 |, added in squares"
     )
     max_excess: float = Field(default=0.3, gt=0, description="| |a|/g - 1 | beyond which the accelerometer is ignored")
     start_tilt_sigma_rad: float = Field(default=0.02, gt=0, description="sigma of roll and pitch at a still start")
