@@ -50,7 +50,7 @@ def trimmed_rmse(points: FloatArray, target: Cloud, T_target_source: FloatArray,
 
 def nearest_distances(points: FloatArray, target: Cloud, T_target_source: FloatArray) -> FloatArray:
     """Distance (n,) of each placed source point (n, d) to its nearest target point."""
-    return np.asarray(target.tree.query(transform_points(T_target_source, points))[0])
+    return target.tree.nearest(transform_points(T_target_source, points))[1]
 
 
 def trimmed_mean_root(distance: FloatArray, keep_fraction: float) -> float:

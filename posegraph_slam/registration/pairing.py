@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.geometry import transform_points
 from posegraph_slam.registration.cloud import Cloud
+from posegraph_slam.registration.kd_tree import build_kd_tree
 from posegraph_slam.registration.settings import AssociationKind, IcpSettings, ResidualKind
 from posegraph_slam.registration.voxel_hash import build_voxel_hash, search_voxel_hash
 
@@ -67,12 +67,10 @@ def association_for(target: Cloud, settings: IcpSettings) -> Association:
 
 def by_tree(target: Cloud, max_distance_m: float) -> Association:
     """Search by the cloud's KD-tree."""
-    # the search excludes its own bound; one float up lets a pair at exactly the gate in
-    bound = np.nextafter(max_distance_m, np.inf)
 
     def associate(moved: FloatArray) -> Pairs:
-        distance, row = (np.asarray(a) for a in target.tree.query(moved, distance_upper_bound=bound, workers=1))
-        source = np.flatnonzero(np.isfinite(distance))
+        row, distance = target.tree.nearest(moved, max_distance_m)
+        source = np.flatnonzero(row >= 0)
         return Pairs(source=source, target=row[source], distance_m=distance[source])
 
     return associate
@@ -138,8 +136,8 @@ def normal_angle_test(max_angle_rad: float) -> Rejection:
 def is_reciprocal(scene: Scene, pairs: Pairs) -> BoolArray:
     """Keep pairs whose source point is the nearest one to their target point, or as near as it."""
     touched, row = np.unique(pairs.target, return_inverse=True)
-    nearest, _ = cKDTree(scene.moved).query(scene.target.points[touched])
-    return np.asarray(pairs.distance_m <= np.asarray(nearest)[row] * (1 + 1e-12))
+    _, nearest = build_kd_tree(scene.moved).nearest(scene.target.points[touched])
+    return np.asarray(pairs.distance_m <= nearest[row] * (1 + 1e-12))
 
 
 def place(source: Cloud, target: Cloud, T_target_source: FloatArray) -> Scene:

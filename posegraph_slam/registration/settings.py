@@ -17,6 +17,8 @@ class ResidualKind(StrEnum):
     """Distance between the points; solved in closed form (Kabsch)."""
     POINT_TO_PLANE = "point_to_plane"
     """Distance to the target's tangent plane, in 2D its tangent line; solved by Gauss-Newton."""
+    GENERALISED = "generalised"
+    """Distance weighed by the flat neighbourhoods of both points (generalised ICP); solved by Gauss-Newton."""
 
 
 class AssociationKind(StrEnum):
@@ -42,7 +44,8 @@ class IcpSettings(Settings):
     residual: ResidualKind = ResidualKind.POINT_TO_PLANE
     """What is minimised; point_to_plane means point-to-line in 2D."""
     association: AssociationKind | None = None
-    """How neighbours are searched; none takes the faster: voxel_hash in the plane, kd_tree in space."""
+    """How neighbours are searched: kd_tree or voxel_hash, in the loop of parts. None takes the compiled loop, with the
+    KD-tree, wherever it has all that is asked for: everything but normal angles and reciprocal pairs."""
     max_distance_m: float = Field(default=0.5, gt=0)
     """Pairs farther apart are dropped."""
     keep_fraction: float = Field(default=1.0, gt=0, le=1)
@@ -67,6 +70,8 @@ class IcpSettings(Settings):
     """A smaller share of paired source points ends in a failure."""
     normal_neighbours: int = Field(default=10, ge=3, le=1000)
     """Nearest points, itself among them, to which the tangent line or plane at a point is fitted."""
+    plane_share: float = Field(default=1e-3, gt=0, le=1)
+    """Variance of a neighbourhood across its line or plane, over that along it, in generalised ICP."""
     degeneracy_ratio: float = Field(default=0.01, gt=0, lt=1)
     """A direction whose share of the Hessian's largest eigenvalue is smaller counts as free."""
     sigma_floor_m: float = Field(default=1e-3, gt=0)
@@ -94,3 +99,8 @@ class IcpSettings(Settings):
     def point_to_line(cls) -> IcpSettings:
         """The default: Gauss-Newton on the distance to tangent lines (planes in 3D) with a Cauchy loss."""
         return cls()
+
+    @classmethod
+    def generalised(cls) -> IcpSettings:
+        """Generalised ICP (Segal, Haehnel and Thrun 2009) with a Cauchy loss, for scans in space."""
+        return cls(residual=ResidualKind.GENERALISED, max_distance_m=1.0)
