@@ -9,10 +9,12 @@ import numpy as np
 from posegraph_slam.arrays import BoolArray, FloatArray
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
 from posegraph_slam.geometry import SE2
+from posegraph_slam.loop_closure.innovation import innovation, linearise
 from posegraph_slam.loop_closure.ledger import Ledger, LoopRecord
-from posegraph_slam.loop_closure.matching import Evidence, register_candidates
+from posegraph_slam.loop_closure.matching import constraints_of, register_candidates
 from posegraph_slam.loop_closure.proposals import (
     Candidates,
+    narrowed,
     propose_fixed_interval,
     propose_proximity,
     propose_start_end,
@@ -22,13 +24,16 @@ from posegraph_slam.loop_closure.verification import (
     chi2_gate,
     consistency_reasons,
     count_support,
+    first_reasons,
+    gaussian_sigmas,
+    passing,
     rejection_reasons,
+    surprise_reasons,
 )
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
 from posegraph_slam.pose_graph.residuals import chi2
 from posegraph_slam.pose_graph.solve import solve
 from posegraph_slam.pose_graph.solver_settings import SolveResult, SolverSettings
-from posegraph_slam.registration.beam_information import information_in_base, information_with_floor
 from posegraph_slam.registration.beam_scans import BeamScans
 
 SETTLING_ROUNDS = 12
@@ -121,33 +126,23 @@ def _verify(
 ) -> Constraints:
     """Register the candidates and return those that pass as constraints between base poses."""
     lidar = graph.poses @ scans.T_base_lidar
+    linear = linearise(graph, settings.drift)
+    covariance = linear.relative_covariance(candidates.target, candidates.source)
+    candidates = narrowed(candidates, covariance)
     evidence = register_candidates(candidates, scans, lidar, settings, executor)
+    constraints = constraints_of(
+        candidates, evidence, scans, settings.covariance_floor_m, settings.covariance_floor_rad
+    )
     reasons = rejection_reasons(candidates, evidence, settings)
-    passed = np.array([not reason for reason in reasons], dtype=np.bool_)
-    agree, disagree = count_support(candidates, evidence.T_target_source, lidar, path_m, passed, settings)
-    reasons = [
-        first or second
-        for first, second in zip(reasons, consistency_reasons(candidates, agree, disagree, settings), strict=True)
-    ]
+    sigmas = gaussian_sigmas(innovation(linear, constraints, covariance), graph.group.dof)
+    sigmas[~passing(reasons)] = np.nan
+    reasons = first_reasons(reasons, surprise_reasons(sigmas, settings))
+    agree, disagree = count_support(candidates, evidence.T_target_source, lidar, path_m, passing(reasons), settings)
+    reasons = first_reasons(reasons, consistency_reasons(candidates, agree, disagree, settings))
     guess = SE2.between(lidar[candidates.target], lidar[candidates.source])
-    ledger.add(round_, candidates, evidence, SE2.local(guess, evidence.T_target_source), reasons)
-    kept = np.flatnonzero([not reason for reason in reasons])
-    return _constraints(candidates.select(kept), evidence, kept, scans, settings)
-
-
-def _constraints(
-    candidates: Candidates, evidence: Evidence, rows: np.ndarray, scans: BeamScans, settings: VerificationSettings
-) -> Constraints:
-    information = information_with_floor(
-        evidence.hessian[rows], settings.covariance_floor_m, settings.covariance_floor_rad
-    )
-    return Constraints(
-        i=candidates.target,
-        j=candidates.source,
-        T_i_j=scans.T_base_lidar @ evidence.T_target_source[rows] @ SE2.inverse(scans.T_base_lidar),
-        information=information_in_base(information, scans.T_base_lidar),
-        kind=candidates.kind,
-    )
+    error = SE2.local(guess, evidence.T_target_source)
+    ledger.add(round_, candidates, evidence, error_before=error, sigmas_before=sigmas, reasons=reasons)
+    return constraints.select(passing(reasons))
 
 
 def settle(
@@ -174,4 +169,4 @@ def settle(
     else:
         kept = squared <= gate
         graph = everything.with_constraints(Constraints.concatenate([chain, closures.select(kept)]))
-    return graph, np.sqrt(squared / graph.group.dof), kept
+    return graph, gaussian_sigmas(squared, graph.group.dof), kept

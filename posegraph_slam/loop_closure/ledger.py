@@ -16,8 +16,8 @@ from posegraph_slam.pose_graph.graph import ConstraintKind
 class LoopRecord:
     """One candidate: keyframes, kind, what was measured, and the decision; `reason` is empty where it was accepted.
 
-    `error_before_m` and `error_before_rad` say how far it lay from the estimate when it was found, `sigmas` how far
-    from the solved graph, in standard deviations (NaN where it never entered the graph).
+    `error_before_m`, `error_before_rad` and `sigmas_before` say how far it lay from the estimate when it was found,
+    `sigmas_after` how far from the solved graph (NaN where it did not come so far).
     """
 
     round: int
@@ -33,7 +33,8 @@ class LoopRecord:
     rmse_m: float
     error_before_m: float
     error_before_rad: float
-    sigmas: float
+    sigmas_before: float
+    sigmas_after: float
     accepted: bool
     reason: str
 
@@ -53,7 +54,14 @@ class Ledger:
         return np.flatnonzero(candidates.travel_m < 0.5 * np.array(last, dtype=np.float64))
 
     def add(
-        self, round_: int, candidates: Candidates, evidence: Evidence, error_before: FloatArray, reasons: list[str]
+        self,
+        round_: int,
+        candidates: Candidates,
+        evidence: Evidence,
+        *,
+        error_before: FloatArray,
+        sigmas_before: FloatArray,
+        reasons: list[str],
     ) -> None:
         """Enter one row a candidate; those without a reason are taken to be in the graph, in this order."""
         for m in range(len(candidates)):
@@ -76,7 +84,8 @@ class Ledger:
                     rmse_m=float(evidence.rmse_m[m]),
                     error_before_m=float(np.hypot(error_before[m, 0], error_before[m, 1])),
                     error_before_rad=float(abs(error_before[m, 2])),
-                    sigmas=float("nan"),
+                    sigmas_before=float(sigmas_before[m]),
+                    sigmas_after=float("nan"),
                     accepted=not reasons[m],
                     reason=reasons[m],
                 )
@@ -88,6 +97,6 @@ class Ledger:
             old = self.records[row]
             reason = "" if kept[k] else f"disagrees with the solved graph by {sigmas[k]:.1f} sigma"
             values = {name: getattr(old, name) for name in LoopRecord.__slots__}
-            values.update(sigmas=float(sigmas[k]), accepted=bool(kept[k]), reason=reason)
+            values.update(sigmas_after=float(sigmas[k]), accepted=bool(kept[k]), reason=reason)
             self.records[row] = LoopRecord(**values)
         self.rows_in_graph = [row for k, row in enumerate(self.rows_in_graph) if kept[k]]

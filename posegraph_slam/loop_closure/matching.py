@@ -9,10 +9,12 @@ import numpy as np
 
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.execution import Executor, split_range
-from posegraph_slam.geometry import pose_from_xyt, xyt_from_pose
+from posegraph_slam.geometry import SE2, pose_from_xyt, xyt_from_pose
 from posegraph_slam.jit import kernel
 from posegraph_slam.loop_closure.proposals import Candidates
 from posegraph_slam.loop_closure.settings import VerificationSettings
+from posegraph_slam.pose_graph.graph import Constraints
+from posegraph_slam.registration.beam_information import information_in_base, information_with_floor
 from posegraph_slam.registration.beam_matching import between, match_scan, visibility
 from posegraph_slam.registration.beam_scans import BeamScans
 from posegraph_slam.registration.local_search import search_pose
@@ -96,6 +98,20 @@ def _register_chunk(work: _Work, settings: VerificationSettings) -> tuple[FloatA
         scans.geometry,
     )
     return pose, hessian, measures
+
+
+def constraints_of(
+    candidates: Candidates, evidence: Evidence, scans: BeamScans, floor_m: float, floor_rad: float
+) -> Constraints:
+    """Turn candidates into constraints between base poses, with a floor on their covariance."""
+    information = information_with_floor(evidence.hessian, floor_m, floor_rad)
+    return Constraints(
+        i=candidates.target,
+        j=candidates.source,
+        T_i_j=scans.T_base_lidar @ evidence.T_target_source @ SE2.inverse(scans.T_base_lidar),
+        information=information_in_base(information, scans.T_base_lidar),
+        kind=candidates.kind,
+    )
 
 
 SEARCH_BEYOND_M = 0.25

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,8 @@ from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.loop_closure.settings import ProposalSettings
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
 
+REACH_SIGMAS = 3.5
+"""Half width of a search window in standard deviations: beyond it a closure would be refused as a surprise."""
 PLACES_AT_ONCE = 256
 """Places from which travel is measured in one call."""
 
@@ -64,6 +67,17 @@ def make_candidates(
         travel_m=travel_m,
         reach_m=np.minimum(2 * drift_sigma_m(travel_m, settings) + 0.1, settings.drift_max_m),
         reach_rad=np.minimum(2 * settings.drift_rad_per_m * travel_m + 0.05, settings.drift_max_rad),
+    )
+
+
+def narrowed(candidates: Candidates, covariance: FloatArray) -> Candidates:
+    """Bound the reach of each candidate by what the graph knows of it: `covariance` (M, 3, 3) of source in target."""
+    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
+    sigma_rad = np.sqrt(covariance[:, 2, 2])
+    return dataclasses.replace(
+        candidates,
+        reach_m=np.minimum(candidates.reach_m, REACH_SIGMAS * sigma_m + 0.1),
+        reach_rad=np.minimum(candidates.reach_rad, REACH_SIGMAS * sigma_rad + 0.05),
     )
 
 

@@ -22,7 +22,7 @@ class ProposalSettings(Settings):
     """Keyframes are gathered into places of about this length of travel; one keyframe of each is tried."""
     view_distance_m: float = Field(default=3.0, gt=0)
     """Places further apart than this, beyond what drift explains, do not see the same surfaces."""
-    travel_min_m: float = Field(default=6.0, gt=0)
+    travel_min_m: float = Field(default=10.0, gt=0)
     """Least travel between two places, counted through closures that are already accepted."""
     travel_first_m: float = Field(default=40.0, gt=0)
     """Longest travel of the first round; each round doubles it, so that short loops are closed first."""
@@ -40,6 +40,15 @@ class ProposalSettings(Settings):
     """Places that are tried for one place in a round."""
     rounds_max: int = Field(default=12, ge=1)
     """Rounds of proposing, verifying and solving."""
+
+
+class DriftSettings(Settings):
+    """What is known of the chain's systematic errors before any loop is closed."""
+
+    heading_sigma_rad_per_m: float = Field(default=0.0015, gt=0)
+    """Standard deviation of the heading bias per metre of travel."""
+    turn_scale_sigma: float = Field(default=0.02, gt=0)
+    """Standard deviation of the share by which turns come out too large or too small."""
 
 
 class VerificationSettings(Settings):
@@ -68,11 +77,13 @@ class VerificationSettings(Settings):
     free_space_margin_m: float = Field(default=0.2, gt=0)
     """A point this much nearer than the other scan's surface contradicts it."""
     sigma_max: float = Field(default=3.0, gt=0)
-    """A closure that disagrees with the solved graph by more sigmas than this is dropped."""
+    """A closure that disagrees by more sigmas than this, with what the graph says of the same motion before it is
+    added or with the solved graph after, is not believed."""
     covariance_floor_m: float = Field(default=0.02, gt=0)
     """A closure is not known better than this,"""
     covariance_floor_rad: float = Field(default=0.005, gt=0)
     """nor than this."""
+    drift: DriftSettings = DriftSettings()
     match: BeamMatchSettings = BeamMatchSettings(gate_start_m=0.6, robust_start_m=0.3, iterations_max=20)
     search: LocalSearchSettings = LocalSearchSettings()
 

@@ -89,6 +89,29 @@ def consistency_reasons(
     return reasons
 
 
+def surprise_reasons(sigmas: FloatArray, settings: VerificationSettings) -> list[str]:
+    """Say for each candidate (M,) that it disagrees too much with the graph as it is, or the empty string."""
+    return [
+        f"would move the graph by {value:.1f} sigma" if value > settings.sigma_max else "" for value in sigmas.tolist()
+    ]
+
+
+def passing(reasons: list[str]) -> BoolArray:
+    """Which candidates (M,) have no reason against them."""
+    return np.array([not reason for reason in reasons], dtype=np.bool_)
+
+
+def first_reasons(earlier: list[str], later: list[str]) -> list[str]:
+    """Join two lists of reasons: the earlier one where there is one."""
+    return [first or second for first, second in zip(earlier, later, strict=True)]
+
+
+def gaussian_sigmas(chi2: FloatArray, dof: int) -> FloatArray:
+    """Turn chi-squares (M,) of `dof` dimensions into the sigmas at which a Gaussian is as rare."""
+    log_tail = chi2_distribution.logsf(chi2, dof)
+    return np.asarray(np.sqrt(chi2_distribution.isf(np.exp(np.maximum(log_tail, -690.0)), 1)))
+
+
 def chi2_gate(sigma: float, dof: int) -> float:
     """Return the chi-square that a right constraint of `dof` dimensions exceeds as rarely as a Gaussian `sigma`s."""
     tail = chi2_distribution.sf(sigma**2, 1)

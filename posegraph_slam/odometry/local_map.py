@@ -27,14 +27,21 @@ def track(increments, sigmas, scheme, search, matching, points, lines, kind, thi
     keyframes = np.zeros(count, np.int64)
     keyposes = np.zeros((count, 3))
     references, known, coasting = int(scheme[0]), 1, scheme[6] > 0
+    stride = int(scheme[7])
+    chosen = np.zeros(references, np.int64)
     prior = np.zeros((3, 3))
     for i in range(1, count):
         if coasting and i > 1:
             start = compose(poses[i - 1], between(poses[i - 2], poses[i - 1]))
         else:
             start = compose(poses[i - 1], increments[i])
-        first = max(0, known - references)
-        refs, ref_poses = keyframes[first:known], keyposes[first:known]
+        for r in range(references):
+            # the last two, then further back in strides: a longer stretch of the map at the same cost
+            chosen[r] = max(known - 1 - (r if r < 2 else 1 + (r - 1) * stride), 0)
+        used = 1
+        while used < references and chosen[used] < chosen[used - 1]:
+            used += 1
+        refs, ref_poses = keyframes[chosen[:used]], keyposes[chosen[:used]]
         for k in range(3):
             prior[k, k] = 1.0 / sigmas[i, k] ** 2
         pose, hessian, stat = match_scan(

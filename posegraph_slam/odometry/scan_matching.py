@@ -28,7 +28,9 @@ class ScanMatchingSettings(Settings):
     matcher: Literal["local_map", "scan_to_scan", "none"] = "local_map"
     """`local_map`: to lines of the last keyframes; `scan_to_scan`: ICP to the scan before; `none`: odometry alone."""
     references: int = Field(default=4, ge=1, le=64)
-    """Keyframes that form the local map."""
+    """Keyframes that form the local map: the last two,"""
+    reference_stride: int = Field(default=3, ge=1, le=64)
+    """and, further back, every n-th."""
     keyframe_distance_m: float = Field(default=0.3, gt=0)
     """A new keyframe is added after this distance,"""
     keyframe_turn_rad: float = Field(default=0.2, gt=0)
@@ -124,6 +126,7 @@ def _track_local_map(
             settings.search_reach_m,
             settings.search_reach_rad,
             float(odometry.source == "none"),
+            settings.reference_stride,
         ]
     )
     poses, stats, hessians, keyframes = track(

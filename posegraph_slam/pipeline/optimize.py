@@ -209,7 +209,7 @@ def _warnings(closed: LoopClosureResult) -> tuple[str, ...]:
     remarks = list(closed.solution.notes)
     if not closed.solution.converged:
         remarks.append(f"the pose graph did not converge: {closed.solution.stop_reason}")
-    dropped = sum(not record.accepted and np.isfinite(record.sigmas) for record in closed.records)
+    dropped = sum(not record.accepted and np.isfinite(record.sigmas_after) for record in closed.records)
     if dropped:
         remarks.append(f"{dropped} closures disagreed with the rest and were taken out; loops.csv says which")
     return tuple(remarks)

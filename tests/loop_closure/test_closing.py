@@ -156,7 +156,7 @@ def test_a_pair_is_tried_again_only_with_a_much_better_guess() -> None:
         T_target_source=SE2.identity(1), hessian=np.eye(3)[None], score=np.zeros(1), matched_fraction=np.zeros(1),
         agreement=np.zeros(1), overlap=np.zeros(1), rmse_m=np.zeros(1), ambiguous=np.zeros(1, dtype=np.bool_),
     )  # fmt: skip
-    ledger.add(0, first, evidence, np.zeros((1, 3)), ["no"])
+    ledger.add(0, first, evidence, error_before=np.zeros((1, 3)), sigmas_before=np.zeros(1), reasons=["no"])
     assert ledger.untried(first).tolist() == []
     better = Candidates(**{**{n: getattr(first, n) for n in first.__dataclass_fields__}, "travel_m": np.array([20.0])})
     assert ledger.untried(better).tolist() == [0]
@@ -177,4 +177,4 @@ def test_settling_stops(laps: Laps, monkeypatch: pytest.MonkeyPatch) -> None:
         kind=np.full(len(target), 3),
     )  # fmt: skip
     _, sigmas, kept = settle(laps.graph, laps.graph.constraints, closures, SOLVER, 3.0)
-    assert (sigmas[kept] ** 2 * 3 <= chi2_gate(3.0, 3)).all()
+    assert (sigmas[kept] <= 3.0 + 1e-9).all()
