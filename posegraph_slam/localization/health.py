@@ -33,18 +33,24 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HealthState:
-    """What is remembered of the best `hypothesis`: mean counts of agreeing and of all telling returns, and the updates."""
+    """What is remembered of the best `hypothesis`: mean counts of its returns, and the updates."""
 
     health: Health
     hypothesis: int = 0
     updates: int = 0
     agree: float = 0.0
     telling: float = 0.0
+    returns: float = 0.0
 
     @property
     def agreement(self) -> float:
         """Share of the telling returns that agree with the map; 0 before there are any."""
         return self.agree / self.telling if self.telling > 0 else 0.0
+
+    @property
+    def explained(self) -> float:
+        """Share of all returns that agree: less than the agreement where the scans reach into unknown space."""
+        return self.agree / self.returns if self.returns > 0 else 0.0
 
 
 def assess(state: HealthState, evidence: Evidence, settings: HealthSettings) -> HealthState:
@@ -65,6 +71,7 @@ def assess(state: HealthState, evidence: Evidence, settings: HealthSettings) -> 
             updates=updates,
             agree=state.agree + gain * (evidence.agree - state.agree),
             telling=state.telling + gain * (telling - state.telling),
+            returns=state.returns + gain * (evidence.returns - state.returns),
         )
     return replace(state, health=_judged(state, evidence, settings))
 
@@ -78,6 +85,7 @@ def _judged(state: HealthState, evidence: Evidence, settings: HealthSettings) ->
         return Health.LOST if state.updates >= settings.updates_min else state.health
     if state.health is Health.OK:
         return Health.OK if certain else Health.AMBIGUOUS
-    if state.agreement < settings.found_above:
+    # Where a map is incomplete, something nearly fits in many places: a new place has to explain the whole scan.
+    if state.explained < settings.found_above:
         return state.health
     return Health.OK if certain and state.updates >= settings.updates_min else Health.AMBIGUOUS

@@ -115,9 +115,9 @@ class HealthSettings(Settings):
     agreement_m: float = Field(default=0.25, gt=0)
     """A return this near to an obstacle agrees with the map; one in known free space, or behind a wall, conflicts."""
     lost_below: float = Field(default=0.45, gt=0, lt=1)
-    """Mean agreement below which the pose is lost,"""
+    """Share of the telling returns that agree, below which the pose is lost."""
     found_above: float = Field(default=0.65, gt=0, lt=1)
-    """and above which a new one is believed."""
+    """Share of all returns that must agree before a new place is believed."""
     memory_updates: float = Field(default=10.0, ge=1)
     """Updates over which the agreement is averaged."""
     evidence_min: int = Field(default=10, ge=1)
@@ -128,7 +128,7 @@ class HealthSettings(Settings):
     """Weight of the best hypothesis below which the pose is ambiguous."""
     sigma_max_m: float = Field(default=0.5, gt=0)
     """Position sigma above which the pose is ambiguous."""
-    updates_min: int = Field(default=8, ge=1)
+    updates_min: int = Field(default=10, ge=1)
     """Updates that a new hypothesis must survive before it is believed."""
 
     @model_validator(mode="after")
