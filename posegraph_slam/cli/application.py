@@ -11,7 +11,16 @@ import typer
 from typer.core import TyperGroup
 
 from posegraph_slam import __version__
-from posegraph_slam.cli import alignment, attitude, configuration, datasets, inspection, optimisation, simulation
+from posegraph_slam.cli import (
+    alignment,
+    attitude,
+    configuration,
+    datasets,
+    inspection,
+    localization,
+    optimisation,
+    simulation,
+)
 from posegraph_slam.errors import PosegraphSlamError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
@@ -79,6 +88,7 @@ def options(
 app.command("optimize", short_help="Optimise a log: trajectory, maps, comparison.")(optimisation.optimize)
 app.command("icp", short_help="Align clouds with the model of an object.")(alignment.icp)
 app.command("inspect", short_help="Show what is in a log, and what is suspicious.")(inspection.inspect)
+app.command("localize", short_help="Find the robot in a known map at every scan.")(localization.localize)
 app.command("simulate", short_help="Write a simulated log with its truth.")(simulation.simulate)
 app.command("attitude", short_help="Estimate orientation from an IMU.")(attitude.attitude)
 app.command("datasets", short_help="List the formats that can be read.")(datasets.datasets)

@@ -39,7 +39,9 @@ def build_search_stack(field: MapField, settings: GlobalSearchSettings) -> Searc
     return SearchStack(likelihood=max_pooled(likelihood, LEVELS), free=max_pooled(free, LEVELS), resolution_m=step)
 
 
-def find_places(stack: SearchStack, points: FloatArray, settings: GlobalSearchSettings) -> tuple[FloatArray, FloatArray]:
+def find_places(
+    stack: SearchStack, points: FloatArray, settings: GlobalSearchSettings
+) -> tuple[FloatArray, FloatArray]:
     """Return the best poses (P, 3) in the grid frame for `points` (n, 2) in the base frame, and their scores (P,) in [0, 1].
 
     Best first, at most `peaks_max`, each further than the separation from better ones. Empty where nothing scores
@@ -105,7 +107,9 @@ def search_peaks(stack, free, cells, gaps, least, peaks_max):  # type: ignore[no
         for by in range(along):
             for bx in range(across):
                 if free[levels, by * width + pad, bx * width + pad] > 0:
-                    bounds[(a * along + by) * across + bx] = block_score(stack[levels], cells[a], bx * width, by * width)
+                    bounds[(a * along + by) * across + bx] = block_score(
+                        stack[levels], cells[a], bx * width, by * width
+                    )
     order = np.argsort(-bounds, kind="mergesort")
     peaks, scores, known = np.zeros((peaks_max, 3), np.int64), np.zeros(peaks_max, np.int64), 0
     todo = np.empty((4 * (levels + 1) + 4, 4), np.int64)

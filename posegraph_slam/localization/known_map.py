@@ -171,9 +171,7 @@ def predict(
         return state
     poses = propagate(state.particles.poses, increment, settings.noise, rng)
     anchor = None if state.anchor is None else _moved_on(state.anchor, increment, settings)
-    return replace(
-        state, particles=state.particles.with_poses(poses), odometry=np.asarray(odometry), anchor=anchor
-    )
+    return replace(state, particles=state.particles.with_poses(poses), odometry=np.asarray(odometry), anchor=anchor)
 
 
 def update(
@@ -224,9 +222,7 @@ def _reported(state: FilterState, found: Estimate) -> tuple[FilterState, Estimat
     return state, replace(found, pose=state.anchor[0], covariance=state.anchor[1])
 
 
-def estimate(
-    state: FilterState, known: PreparedMap, scan: ScanPoints, settings: LocalizationSettings
-) -> Estimate:
+def estimate(state: FilterState, known: PreparedMap, scan: ScanPoints, settings: LocalizationSettings) -> Estimate:
     """Return the refined mean of the heaviest hypothesis; where the pose is not known, with the spread of all."""
     particles, weights = state.particles, state.particles.weights
     numbers, shares = hypothesis_weights(particles, weights)
@@ -309,14 +305,10 @@ def _due(state: FilterState, settings: LocalizationSettings) -> bool:
     if state.updated_at is None:
         return True
     moved = _between(state.updated_at, state.odometry)
-    return bool(
-        np.hypot(moved[0], moved[1]) >= settings.update_distance_m or abs(moved[2]) >= settings.update_turn_rad
-    )
+    return bool(np.hypot(moved[0], moved[1]) >= settings.update_distance_m or abs(moved[2]) >= settings.update_turn_rad)
 
 
-def _weighed(
-    state: FilterState, known: PreparedMap, scan: ScanPoints, settings: LocalizationSettings
-) -> FilterState:
+def _weighed(state: FilterState, known: PreparedMap, scan: ScanPoints, settings: LocalizationSettings) -> FilterState:
     log_weights = state.particles.log_weights.copy()
     add_log_likelihoods(
         state.particles.poses, scan.sparse, known.field.log_likelihood, known.field.outside,

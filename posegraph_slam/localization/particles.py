@@ -43,9 +43,7 @@ class Particles:
 
     def drawn(self, index: IntArray) -> Particles:
         """Return the particles at `index`, all of one weight."""
-        return Particles(
-            poses=self.poses[index], log_weights=np.zeros(len(index)), hypothesis=self.hypothesis[index]
-        )
+        return Particles(poses=self.poses[index], log_weights=np.zeros(len(index)), hypothesis=self.hypothesis[index])
 
 
 def around(pose: FloatArray, sigmas: FloatArray, count: int, hypothesis: int, rng: np.random.Generator) -> Particles:

@@ -144,7 +144,10 @@ class LocalizationSettings(Settings):
     propagation: Literal["scan_matching", "odometry"] = "scan_matching"
     """The motion that moves the particles: of scans matched to the ones before them, or of the odometry itself."""
     matched_noise: MotionNoise = MotionNoise(
-        translation_per_sqrt_m=0.01, translation_per_sqrt_rad=0.005, rotation_per_sqrt_rad=0.02, rotation_per_sqrt_m=0.003
+        translation_per_sqrt_m=0.01,
+        translation_per_sqrt_rad=0.005,
+        rotation_per_sqrt_rad=0.02,
+        rotation_per_sqrt_m=0.003,
     )
     """Noise of the motion by scan matching, good to about 1 %,"""
     odometry_noise: MotionNoise = MotionNoise(

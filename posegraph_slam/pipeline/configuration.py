@@ -11,6 +11,7 @@ from pathlib import Path
 from pydantic import Field
 
 from posegraph_slam.errors import ConfigurationError
+from posegraph_slam.localization.settings import LocalizationSettings
 from posegraph_slam.loop_closure.settings import LoopClosureSettings
 from posegraph_slam.mapping.occupancy import OccupancySettings
 from posegraph_slam.mapping.texture import TextureSettings
@@ -24,7 +25,7 @@ from posegraph_slam.settings import Settings
 
 
 class Configuration(Settings):
-    """Every key of `psg optimize` with its value."""
+    """Every key of the commands that run on a log, with its value."""
 
     seed: int = Field(0, ge=0)
     """Seed of every random choice; the same log, seed and configuration give the same results."""
@@ -37,6 +38,7 @@ class Configuration(Settings):
     pose_graph: SolverSettings = SolverSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
     mapping: OccupancySettings = OccupancySettings()
     texture: TextureSettings = TextureSettings()
+    localization: LocalizationSettings = LocalizationSettings()
 
 
 def preset_folder() -> Path:

@@ -1,0 +1,83 @@
+"""`psg localize`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Set
+from posegraph_slam.cli.console import ProgressBars, print_json, print_note
+
+if TYPE_CHECKING:
+    from posegraph_slam.arrays import FloatArray
+    from posegraph_slam.pipeline.localize import LocalizationSummary
+
+Map = Annotated[Path, typer.Argument(metavar="MAP", help="YAML file of a nav2 map.")]
+
+
+def localize(
+    known_map: Map,
+    log: Log,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Run directory.")],
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="X,Y,YAW", help="Pose of the first scan (m, rad); without it, search the map."),
+    ] = None,
+    config: Config = None,
+    settings: Set = None,
+    log_format: Format = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Find a robot in a known map at every scan of its log, and say when its pose is not known."""
+    from posegraph_slam.pipeline.configuration import load_configuration
+    from posegraph_slam.pipeline.localize import run_localization
+
+    configuration = load_configuration(config or [], settings or [], seed=seed)
+    with ProgressBars(enabled=not quiet) as progress:
+        summary = run_localization(
+            known_map,
+            log,
+            configuration,
+            out=out,
+            start=None if start is None else parse_pose(start),
+            overwrite=overwrite,
+            log_format=log_format,
+            progress=progress,
+        )
+    if as_json:
+        print_json({"folder": str(summary.folder), "metrics": summary.metrics, "run": summary.record})
+    elif not quiet:
+        print_summary(summary)
+
+
+def parse_pose(text: str) -> FloatArray:
+    """Return the three numbers of `x,y,yaw`; raise InputError for anything else."""
+    import numpy as np
+
+    from posegraph_slam.errors import InputError
+
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise InputError("--start", f"'{text}' is not a pose", "give x,y,yaw in metres and radians, as 1.5,-2,0.7")
+    return values
+
+
+def print_summary(summary: LocalizationSummary) -> None:
+    """Print when the pose was known, then where the results lie; remarks go to stderr."""
+    for remark in summary.remarks:
+        print_note(remark)
+    metrics = summary.metrics
+    counts = ", ".join(f"{count} {name}" for name, count in reversed(metrics["health"].items()))
+    typer.echo(f"scans     {metrics['scans']} ({counts})")
+    if metrics["first_known_s"] is not None:
+        typer.echo(f"known     from {metrics['first_known_s']:.1f} s on, lost {metrics['times_lost']} times")
+        typer.echo(f"sigma     {metrics['median_position_sigma_m']:.3f} m (median of the position)")
+    typer.echo(f"\nresults:  {summary.folder}")
