@@ -13,7 +13,10 @@ STANDARD_GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Imu:
-    """`stamps_s` (N,), `angular_velocity` (N, 3) rad/s and `linear_acceleration` (N, 3) m/s^2 in the imu frame."""
+    """`stamps_s` (N,), `angular_velocity` (N, 3) rad/s and `linear_acceleration` (N, 3) m/s^2 in the imu frame.
+
+    A rate is NaN where the gyro is known to have said nothing.
+    """
 
     stamps_s: FloatArray
     angular_velocity: FloatArray
