@@ -31,7 +31,7 @@ HOMES = {
     "matplotlib": ("report/",),
     "dask": ("pipeline/",),
     "distributed": ("pipeline/",),
-    "cv2": ("datasets/simulation/files.py", "mapping/images.py"),
+    "cv2": ("datasets/simulation/files.py", "localization/free_space.py", "mapping/images.py"),
     "open3d": (),
     "evo": (),  # GPL: an oracle in the tests, never a part of the package
     "small_gicp": (),

@@ -19,6 +19,7 @@ from posegraph_slam.cli import (
     inspection,
     localization,
     optimisation,
+    particle_slam,
     simulation,
 )
 from posegraph_slam.errors import PosegraphSlamError
@@ -89,6 +90,7 @@ app.command("optimize", short_help="Optimise a log: trajectory, maps, comparison
 app.command("icp", short_help="Align clouds with the model of an object.")(alignment.icp)
 app.command("inspect", short_help="Show what is in a log, and what is suspicious.")(inspection.inspect)
 app.command("localize", short_help="Find the robot in a known map at every scan.")(localization.localize)
+app.command("pf-slam", short_help="Map a log with a particle filter.")(particle_slam.pf_slam)
 app.command("simulate", short_help="Write a simulated log with its truth.")(simulation.simulate)
 app.command("attitude", short_help="Estimate orientation from an IMU.")(attitude.attitude)
 app.command("datasets", short_help="List the formats that can be read.")(datasets.datasets)

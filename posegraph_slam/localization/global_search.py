@@ -42,7 +42,7 @@ def build_search_stack(field: MapField, settings: GlobalSearchSettings) -> Searc
 def find_places(
     stack: SearchStack, points: FloatArray, settings: GlobalSearchSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the best poses (P, 3) in the grid frame for `points` (n, 2) in the base frame, and their scores (P,) in [0, 1].
+    """Return the best poses (P, 3) in the grid frame for `points` (n, 2) (base frame), and their scores (P,) in [0, 1].
 
     Best first, at most `peaks_max`, each further than the separation from better ones. Empty where nothing scores
     `score_min`, or there are fewer than ten points.

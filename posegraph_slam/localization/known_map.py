@@ -39,7 +39,7 @@ class FilterState:
     """Everything the filter carries from scan to scan; poses are in the grid frame of the map.
 
     `anchor` is the last pose that was known, moved on by odometry since, and its covariance; it is what a lost robot
-    falls back to. `recent` are the last scans that weighed the particles, each with the robot's odometry pose (3,) at it.
+    falls back to. `recent` are the last scans that weighed the particles, each with its odometry pose (3,).
     """
 
     particles: Particles
@@ -101,7 +101,7 @@ def localize(
     start: FloatArray | None = None,
     progress: Progress = silent_progress,
 ) -> LocalizationResult:
-    """Localise every scan (N) in a known map, from odometry poses (N, 3, 3) and a start pose (3,) [x, y, theta] or none.
+    """Localise every scan (N) in a known map, from odometry poses (N, 3, 3) and a start (3,) [x, y, theta] or none.
 
     With a start, its pose of the first scan in the map, the robot is tracked from there; without one the whole map is
     searched. The result depends on the inputs and the generator alone.
@@ -333,7 +333,7 @@ def _recent_points(state: FilterState, settings: LocalizationSettings) -> FloatA
         c, s = np.cos(theta), np.sin(theta)
         parts.append(scan.sparse @ np.array([[c, s], [-s, c]]) + [x, y])
     points = np.concatenate(parts)
-    return points[np.hypot(points[:, 0], points[:, 1]) <= settings.search.range_max_m]
+    return np.asarray(points[np.hypot(points[:, 0], points[:, 1]) <= settings.search.range_max_m])
 
 
 def _resampled(

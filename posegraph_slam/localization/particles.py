@@ -64,7 +64,7 @@ def joined(parts: list[Particles]) -> Particles:
 
 @kernel
 def moments(poses, weights, used):  # type: ignore[no-untyped-def]
-    """Mean (3,) of the particles marked in `used`, their covariance (3, 3) in the mean's own frame, and their weight."""
+    """Mean (3,) of the particles marked in `used`, covariance (3, 3) in the mean's own frame, and weight."""
     total, sx, sy, sc, ss = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(poses)):
         if used[k]:
@@ -94,7 +94,7 @@ def moments(poses, weights, used):  # type: ignore[no-untyped-def]
 def hypothesis_weights(particles: Particles, weights: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the numbers (H,) of the hypotheses and the weight (H,) of each."""
     numbers, inverse = np.unique(particles.hypothesis, return_inverse=True)
-    return numbers, np.bincount(inverse, weights=weights)
+    return numbers, np.asarray(np.bincount(inverse, weights=weights), dtype=np.float64)
 
 
 def merged(particles: Particles, gap_m: float, gap_rad: float) -> Particles:

@@ -50,7 +50,7 @@ def resample(weights: FloatArray, count: int, scheme: ResamplingScheme, rng: np.
 def occupied_bins(particles: FloatArray, bin_m: float, bin_rad: float) -> int:
     """Return how many bins of position and heading the particles (N, 3) fall into."""
     bins = np.floor(particles / [bin_m, bin_m, bin_rad]).astype(np.int64)
-    bins[:, 2] %= max(int(round(2 * np.pi / bin_rad)), 1)
+    bins[:, 2] %= max(round(2 * np.pi / bin_rad), 1)
     low, high = bins.min(axis=0), bins.max(axis=0)
     span = high - low + 1
     code = ((bins[:, 0] - low[0]) * span[1] + bins[:, 1] - low[1]) * span[2] + bins[:, 2] - low[2]
@@ -58,7 +58,7 @@ def occupied_bins(particles: FloatArray, bin_m: float, bin_rad: float) -> int:
 
 
 def needed_number(bins: int, settings: ParticleNumberSettings) -> int:
-    """Return how many particles stand for a distribution over `bins` bins within the allowed error (Fox 2003, eq. 7)."""
+    """Return how many particles a distribution over `bins` bins needs for the allowed error (Fox 2003, eq. 7)."""
     if bins < 2:
         return settings.minimum
     a = 2.0 / (9.0 * (bins - 1))

@@ -12,7 +12,7 @@ from posegraph_slam.registration.beam_scans import BeamScans
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScanPoints:
-    """Returns `points` (n, 2) in the base frame, their `normals` (n, 3) with 1 where there is one, and the `sensor` (2,).
+    """Returns `points` (n, 2) in the base frame, `normals` (n, 3) with 1 where there is one, and the `sensor` (2,).
 
     `sparse` (m, 2) are the few among them that weigh particles.
     """

@@ -12,6 +12,8 @@ from pydantic import Field
 
 from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.localization.settings import LocalizationSettings
+from posegraph_slam.localization.slam_settings import ParticleSlamSettings
+from posegraph_slam.loop_closure.refinement import RefinementSettings
 from posegraph_slam.loop_closure.settings import LoopClosureSettings
 from posegraph_slam.mapping.occupancy import OccupancySettings
 from posegraph_slam.mapping.texture import TextureSettings
@@ -35,10 +37,16 @@ class Configuration(Settings):
     scans: BeamScanSettings = BeamScanSettings()
     scan_matching: ScanMatchingSettings = ScanMatchingSettings()
     loop_closure: LoopClosureSettings = LoopClosureSettings()
+    refinement: RefinementSettings = RefinementSettings()
+    smoothing: bool = True
+    """Smooth the poses of all scans between the keyframes with the odometry."""
     pose_graph: SolverSettings = SolverSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
+    maps: bool = True
+    """Rebuild the maps from the trajectories."""
     mapping: OccupancySettings = OccupancySettings()
     texture: TextureSettings = TextureSettings()
     localization: LocalizationSettings = LocalizationSettings()
+    particle_slam: ParticleSlamSettings = ParticleSlamSettings()
 
 
 def preset_folder() -> Path:
