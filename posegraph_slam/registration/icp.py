@@ -6,18 +6,42 @@ import math
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
+from posegraph_slam.registration.compiled_loop import (
+    CONVERGED,
+    DEGENERATE,
+    GENERALISED,
+    MAX_ITERATIONS,
+    PLANE,
+    POINT,
+    TOO_FEW_INLIERS,
+    run_loop,
+)
 from posegraph_slam.registration.pairing import Pairs, Scene, association_for, pair_points, place, rejections_for
-from posegraph_slam.registration.residuals import Residual, linearise, residual_for
+from posegraph_slam.registration.residuals import Residual, residual_for
 from posegraph_slam.registration.result import RegistrationResult, RegistrationStatus
-from posegraph_slam.registration.robust import influence_slopes, residual_scale, robust_weights
-from posegraph_slam.registration.settings import IcpSettings, Loss
-from posegraph_slam.registration.uncertainty import Evidence, information_of
+from posegraph_slam.registration.robust import residual_scale, robust_weights
+from posegraph_slam.registration.settings import IcpSettings, Loss, ResidualKind
+from posegraph_slam.registration.uncertainty import describe_pairs
 
 DEFAULT_SETTINGS = IcpSettings()
+
+RESIDUALS = {
+    ResidualKind.POINT_TO_POINT: POINT,
+    ResidualKind.POINT_TO_PLANE: PLANE,
+    ResidualKind.GENERALISED: GENERALISED,
+}
+LOSSES = {loss: number for number, loss in enumerate(Loss)}
+STATUSES = {
+    CONVERGED: RegistrationStatus.CONVERGED,
+    MAX_ITERATIONS: RegistrationStatus.MAX_ITERATIONS,
+    TOO_FEW_INLIERS: RegistrationStatus.TOO_FEW_INLIERS,
+    DEGENERATE: RegistrationStatus.DEGENERATE,
+}
+NO_NORMALS = read_only(np.zeros((1, 3)))
 
 
 def icp(
@@ -40,27 +64,71 @@ def icp(
         return failed(RegistrationStatus.TOO_FEW_POINTS, source.dimension)
     if not (source.spans_plane and target.spans_plane):
         return failed(RegistrationStatus.DEGENERATE, source.dimension)
-    residual, associate, rejections = (
-        residual_for(settings),
-        association_for(target, settings),
-        rejections_for(settings),
-    )
-    status, iteration = RegistrationStatus.MAX_ITERATIONS, 0
+    if runs_compiled(settings):
+        return _run_compiled(source, target, T, settings)
+    return _run_parts(source, target, T, settings)
+
+
+def runs_compiled(settings: IcpSettings) -> bool:
+    """Whether the compiled loop has every part that the settings name."""
+    return settings.association is None and settings.max_normal_angle_rad is None and not settings.reciprocal
+
+
+def _run_compiled(source: Cloud, target: Cloud, T: FloatArray, settings: IcpSettings) -> RegistrationResult:
+    """Run the loop as one kernel."""
+    d, tree = source.dimension, target.tree
+    start = pose_in_space(T, d)
+    residual, loss, options = options_of(settings, len(source))
+    surface = target.surface
+    found, status, iterations, s, t = run_loop(
+        d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value,
+        surface.anchors, target.normals_in_space, surface.trust, _source_normals(source, settings), start, residual,
+        loss, options)  # fmt: skip
+    if status in (TOO_FEW_INLIERS, DEGENERATE):
+        return failed(STATUSES[status], d, pairs=len(s), iterations=iterations)
+    return _described(found, source, target, s, t, settings, STATUSES[status], iterations)
+
+
+def _run_parts(source: Cloud, target: Cloud, T: FloatArray, settings: IcpSettings) -> RegistrationResult:
+    """Run the loop part by part; the compiled loop does the same, and this one is its oracle."""
+    residual, associate = residual_for(settings), association_for(target, settings)
+    rejections = rejections_for(settings)
+    status, iteration, remembered, power, lap = RegistrationStatus.MAX_ITERATIONS, 0, T, 1, 0
     for iteration in range(1, settings.max_iterations + 1):
         scene = place(source, target, T)
         pairs = pair_points(scene, associate, rejections)
         if len(pairs) < max(settings.min_inliers, settings.min_inlier_fraction * len(source)):
             return failed(RegistrationStatus.TOO_FEW_INLIERS, source.dimension, pairs=len(pairs), iterations=iteration)
-        better = residual.improve(scene, pairs, _weights(residual, scene, pairs, settings)[0])
+        better = residual.improve(scene, pairs, _weights(residual, scene, pairs, settings))
         if better is None:
             return failed(RegistrationStatus.DEGENERATE, source.dimension, pairs=len(pairs), iterations=iteration)
-        settled = has_settled(T, better, settings)
+        # a pose that comes back to an earlier one runs in a circle of pairings (Brent 1980): it settles no further
+        settled = has_settled(T, better, settings) or (iteration > 2 and has_settled(remembered, better, settings))
         T = better
         if settled:
             status = RegistrationStatus.CONVERGED
             break
+        lap += 1
+        if lap == power:
+            remembered, power, lap = T, 2 * power, 0
     # the last step is below the tolerances, or the loop gave up: either way the last pairs describe the end
-    return _described(residual, place(source, target, T), pairs, settings, status, iteration)
+    d = source.dimension
+    found = pose_in_space(T, d)
+    return _described(found, source, target, pairs.source, pairs.target, settings, status, iteration)
+
+
+def pose_in_space(T: FloatArray, d: int) -> FloatArray:
+    """Pose (4, 4) of points (n, 3) that does to the first d coordinates what T (d+1, d+1) does."""
+    result = np.eye(4)
+    result[:d, :d], result[:d, 3] = T[:d, :d], T[:d, d]
+    return result
+
+
+def in_plane(T: FloatArray) -> FloatArray:
+    """Pose (3, 3) of the first two coordinates of a pose (4, 4) that turns about the third axis."""
+    result = np.eye(3)
+    result[:2, :2], result[:2, 2] = T[:2, :2], T[:2, 3]
+    return result
 
 
 def has_settled(T_before: FloatArray, T_after: FloatArray, settings: IcpSettings) -> bool:
@@ -104,38 +172,54 @@ def _checked_pose(T_target_source: FloatArray, source: Cloud, target: Cloud) -> 
     return T
 
 
-def _weights(residual: Residual, scene: Scene, pairs: Pairs, settings: IcpSettings) -> tuple[FloatArray, float]:
-    """Weights (m,) of the pairs, and the mean curvature of the robust loss over its mean weight."""
+def options_of(settings: IcpSettings, points: int) -> tuple[int, int, FloatArray]:
+    """Residual and loss as numbers, and the other settings in the order that the kernels expect."""
+    least = max(settings.min_inliers, settings.min_inlier_fraction * points)
+    options = np.array([
+        settings.max_distance_m, settings.keep_fraction, settings.loss_scale_m or 0.0, settings.max_iterations,
+        settings.rotation_tolerance_rad, settings.translation_tolerance_m, least, settings.degeneracy_ratio,
+        settings.plane_share, settings.sigma_floor_m, settings.free_sigma_m,
+    ])  # fmt: skip
+    return RESIDUALS[settings.residual], LOSSES[settings.loss], options
+
+
+def _source_normals(source: Cloud, settings: IcpSettings) -> FloatArray:
+    """Normals of the source where they count, else none: they need not be fitted then."""
+    if settings.residual is not ResidualKind.GENERALISED:
+        return NO_NORMALS
+    return source.normals_in_space
+
+
+def _weights(residual: Residual, scene: Scene, pairs: Pairs, settings: IcpSettings) -> FloatArray:
+    """Weights (m,) of the pairs."""
     trust = residual.trust(scene, pairs)
     if settings.loss is Loss.NONE:
-        return trust, 1.0
+        return trust
     lengths = residual.lengths(scene, pairs)
     scale = settings.loss_scale_m or residual_scale(
         lengths, residual.dimension(scene), settings.translation_tolerance_m
     )
-    weights = robust_weights(settings.loss, lengths, scale)
-    slope = float(trust @ influence_slopes(settings.loss, lengths, scale) / (trust @ weights + 1e-300))
-    return trust * weights, max(slope, 0.1)
+    return trust * robust_weights(settings.loss, lengths, scale)
 
 
 def _described(
-    residual: Residual, scene: Scene, pairs: Pairs, settings: IcpSettings, status: RegistrationStatus, iterations: int
-) -> RegistrationResult:
-    """Measure the pairs at the final pose."""
-    lengths, trust = residual.lengths(scene, pairs), residual.trust(scene, pairs)
-    weights, slope = _weights(residual, scene, pairs, settings)
-    frame, jacobian = linearise(scene, pairs)
-    # tangential distances of point pairs come from sampling, not from noise, yet they are what moves point-to-point
-    errors = lengths
-    evidence = Evidence(frame=frame, jacobian=jacobian, weights=weights, residuals_m=errors, slope=slope,
-                        target=pairs.target)  # fmt: skip
-    information, free = information_of(evidence, scene.target.surface, settings)
+    T: FloatArray, source: Cloud, target: Cloud, s: IntArray, t: IntArray, settings: IcpSettings,
+    status: RegistrationStatus, iterations: int,
+) -> RegistrationResult:  # fmt: skip
+    """Measure the pairs of rows s and t (m,) at the final pose (4, 4)."""
+    d, surface = source.dimension, target.surface
+    residual, loss, options = options_of(settings, len(source))
+    information, free, _, rmse = describe_pairs(
+        d, T, source.in_space, target.in_space, surface.anchors, target.normals_in_space, surface.trust,
+        surface.thickness_m, surface.neighbours, _source_normals(source, settings), s, t, residual, loss,
+        options)  # fmt: skip
+    pose = T if d == 3 else in_plane(T)
     return RegistrationResult(
-        T_target_source=scene.T_target_source,
+        T_target_source=pose,
         status=status,
-        inliers=len(pairs),
-        inlier_fraction=len(pairs) / len(scene.source),
-        rmse_m=float(np.sqrt(trust @ lengths**2 / max(trust.sum(), 1e-300))),
+        inliers=len(s),
+        inlier_fraction=len(s) / len(source),
+        rmse_m=rmse,
         information=information,
         degenerate_directions=free,
         iterations=iterations,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.jit import kernel
 
 LEAF = 8
@@ -46,12 +46,12 @@ def build_kd_tree(points: FloatArray) -> KdTree:
 
 
 def in_space(points: FloatArray) -> FloatArray:
-    """Points (n, 3): those of the plane get a zero."""
+    """Points (n, 3), not to be written to: those of the plane get a zero."""
     if points.shape[1] == 3:
-        return np.ascontiguousarray(points)
+        return read_only(points)
     padded = np.zeros((len(points), 3))
     padded[:, :2] = points
-    return padded
+    return read_only(padded)  # always: writable arrays would compile every kernel anew
 
 
 @kernel
@@ -107,30 +107,31 @@ def select_middle(order: IntArray, points: FloatArray, a: int, start: int, stop:
 
 
 @kernel
-def nearest_one(
+def nearest_two(
     x: float, y: float, z: float, rows: IntArray, points: FloatArray, axis: IntArray, value: FloatArray,
-    best: int, best_square: float, stack: IntArray, bounds: FloatArray,
-) -> tuple[int, float]:  # fmt: skip
-    """Row and squared distance of the nearest point to (x, y, z) within the square given; `best` starts the search.
+    best: int, best_square: float, limit: float, stack: IntArray, bounds: FloatArray,
+) -> tuple[int, float, float]:  # fmt: skip
+    """Row and squared distance of the point nearest to (x, y, z), and the squared distance of all others at least.
 
-    `stack` (STACK, 3) and `bounds` (STACK, 4) are scratch: node and range, and square and offsets of its box.
+    Only points up to the squared distance `limit` count. `best` and `best_square` may name one of them to start from;
+    -1 and `limit` if none is known. `stack` (STACK, 3) and `bounds` (STACK, 4) are scratch: node and range, and square
+    and offsets of its box.
     """
-    nodes = len(axis)
-    top = 0
+    nodes, top, second = len(axis), 0, limit
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, len(rows)
     bounds[0, 0] = bounds[0, 1] = bounds[0, 2] = bounds[0, 3] = 0.0
     while top >= 0:
         node, start, stop = stack[top, 0], stack[top, 1], stack[top, 2]
         square, ox, oy, oz = bounds[top, 0], bounds[top, 1], bounds[top, 2], bounds[top, 3]
         top -= 1
-        if square > best_square:
+        if square > second:
             continue
         while node < nodes:
             a, middle = axis[node], (start + stop) // 2
             gap = (x if a == 0 else (y if a == 1 else z)) - value[node]
             offset = ox if a == 0 else (oy if a == 1 else oz)
             beyond = square - offset * offset + gap * gap
-            if beyond <= best_square:
+            if beyond <= second:
                 top += 1
                 bounds[top, 0] = beyond
                 bounds[top, 1] = gap if a == 0 else ox
@@ -147,9 +148,14 @@ def nearest_one(
         for k in range(start, stop):
             dx, dy, dz = x - points[k, 0], y - points[k, 1], z - points[k, 2]
             distance = dx * dx + dy * dy + dz * dz
+            if distance > second or rows[k] == best:
+                continue
             if distance < best_square or (distance == best_square and (best < 0 or rows[k] < best)):
+                second = best_square
                 best, best_square = rows[k], distance
-    return best, best_square
+            else:
+                second = distance
+    return best, best_square, second
 
 
 @kernel
@@ -161,8 +167,8 @@ def nearest_rows(
     found, distance = np.full(m, -1, dtype=np.int64), np.full(m, np.inf)
     stack, bounds = np.zeros((STACK, 3), dtype=np.int64), np.zeros((STACK, 4))
     for q in range(m):
-        row, square = nearest_one(queries[q, 0], queries[q, 1], queries[q, 2], rows, points, axis, value,
-                                  -1, gate * gate, stack, bounds)  # fmt: skip
+        row, square, _ = nearest_two(queries[q, 0], queries[q, 1], queries[q, 2], rows, points, axis, value,
+                                     -1, gate * gate, gate * gate, stack, bounds)  # fmt: skip
         found[q] = row
         if row >= 0:
             distance[q] = np.sqrt(square)

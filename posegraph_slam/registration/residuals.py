@@ -8,10 +8,11 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.geometry import SE2, SE3, align_points
+from posegraph_slam.geometry.so3 import hat
 from posegraph_slam.jit import kernel
+from posegraph_slam.registration.frames import Frame, balanced_frame, split_directions
 from posegraph_slam.registration.pairing import Pairs, Scene
 from posegraph_slam.registration.settings import IcpSettings, ResidualKind
-from posegraph_slam.registration.uncertainty import Frame, balanced_frame, split_directions
 
 
 class Residual(Protocol):
@@ -73,10 +74,62 @@ class PointToPlane:
         return group.retract(scene.T_target_source, frame.to_origin @ step)
 
 
+class GeneralisedIcp:
+    """Shifts between paired points in the metric of the flat neighbourhoods of both (Segal, Haehnel, Thrun 2009).
+
+    The neighbourhood at a point has variance 1 along its line or plane and `plane_share` across it. The metric is
+    scaled so that a shift along two equal normals counts once.
+    """
+
+    def __init__(self, degeneracy_ratio: float, plane_share: float) -> None:
+        self.degeneracy_ratio, self.plane_share = degeneracy_ratio, plane_share
+
+    def dimension(self, scene: Scene) -> int:
+        return 1
+
+    def lengths(self, scene: Scene, pairs: Pairs) -> FloatArray:
+        shift = scene.moved[pairs.source] - scene.target.points[pairs.target]
+        return np.asarray(np.sqrt(np.einsum("ma,mab,mb->m", shift, self.metric(scene, pairs), shift)))
+
+    def trust(self, scene: Scene, pairs: Pairs) -> FloatArray:
+        return np.ones(len(pairs))
+
+    def metric(self, scene: Scene, pairs: Pairs) -> FloatArray:
+        """Metric (m, d, d) of every pair: 2 e (C_target + R C_source R^T)^-1 with C = 1 - (1 - e) n n^T."""
+        d, e = scene.source.dimension, self.plane_share
+        n = scene.target.surface.normals[pairs.target]
+        m = scene.source.surface.normals[pairs.source] @ scene.T_target_source[:d, :d].T
+        outer = np.einsum("ma,mb->mab", n, n) + np.einsum("ma,mb->mab", m, m)
+        return np.asarray(2 * e * np.linalg.inv(2 * np.eye(d) - (1 - e) * outer))
+
+    def improve(self, scene: Scene, pairs: Pairs, weights: FloatArray) -> FloatArray | None:
+        d = scene.source.dimension
+        group, R = (SE2 if d == 2 else SE3), scene.T_target_source[:d, :d]
+        points = scene.source.points[pairs.source]
+        centre = points.mean(axis=0)
+        radius = max(float(np.sqrt(np.sum((points - centre) ** 2, axis=1).mean())), 1e-9)
+        arm = (points - centre) / radius
+        if d == 2:  # a turn moves a point at (x, y) by (-y, x)
+            turn = np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
+            rows = np.concatenate([np.broadcast_to(np.eye(2), (len(arm), 2, 2)), turn], axis=2)
+        else:
+            rows = np.concatenate([-hat(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+        jacobian = R @ rows
+        pulled = np.swapaxes(jacobian, 1, 2) @ (weights[:, None, None] * self.metric(scene, pairs))
+        shift = scene.moved[pairs.source] - scene.target.points[pairs.target]
+        basis, values, _ = split_directions(np.sum(pulled @ jacobian, axis=0), self.degeneracy_ratio)
+        if len(values) == 0:
+            return None
+        step = -basis @ ((basis.T @ np.sum(pulled @ shift[:, :, None], axis=0)[:, 0]) / values)
+        return group.retract(scene.T_target_source, balanced_frame(centre, radius).to_origin @ step)
+
+
 def residual_for(settings: IcpSettings) -> Residual:
     """Return the residual that `settings` names."""
     if settings.residual is ResidualKind.POINT_TO_POINT:
         return PointToPoint()
+    if settings.residual is ResidualKind.GENERALISED:
+        return GeneralisedIcp(settings.degeneracy_ratio, settings.plane_share)
     return PointToPlane(settings.degeneracy_ratio)
 
 

@@ -1,117 +1,281 @@
-"""Information and free directions of a registration from the Jacobian of its residuals."""
+"""Information and free directions of a registration from the scores of its pairs."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
-from posegraph_slam.geometry import SE2, SE3
 from posegraph_slam.jit import kernel
-from posegraph_slam.registration.cloud import Surface
-from posegraph_slam.registration.settings import IcpSettings
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Frame:
-    """A tangent frame in which metres and radians compare: centred on the points, turns measured on their radius.
-
-    A tangent d at the source origin and e in this frame are the same motion if d = `to_origin` e; `to_origin` (p, p).
-    """
-
-    to_origin: FloatArray
-
-
-def balanced_frame(centre: FloatArray, radius_m: float) -> Frame:
-    """Make the tangent frame about `centre` (d,) in which one unit of turn moves points at `radius_m` by 1 m."""
-    d = len(centre)
-    shift = np.eye(d + 1)
-    shift[:d, d] = centre
-    unit = np.ones(3 * (d - 1))
-    unit[rotation_part(d)] = 1.0 / radius_m
-    return Frame(to_origin=(SE2 if d == 2 else SE3).adjoint(shift) * unit)
-
-
-def rotation_part(dimension: int) -> slice:
-    """Where the rotation stands in a tangent: last in SE(2), first in SE(3)."""
-    return slice(2, 3) if dimension == 2 else slice(0, 3)
-
-
-def split_directions(hessian: FloatArray, ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Eigenvectors that the Hessian (p, p) holds, as columns (p, k), their values (k,), and the free ones (p, p-k).
-
-    Free are those whose eigenvalue is under `ratio` of the largest (Zhang, Kaess and Singh 2016).
-    """
-    values, vectors = np.linalg.eigh(hessian)
-    held = values > max(ratio * values[-1], np.finfo(np.float64).tiny)
-    return vectors[:, held], values[held], vectors[:, ~held]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Evidence:
-    """What a solution rests on: `jacobian` (m, p) in `frame`, robust `weights` and `residuals_m` (m,) of its pairs.
-
-    `slope` is the mean curvature of the loss over its mean weight; `target` (m,) the target rows of the pairs.
-    """
-
-    frame: Frame
-    jacobian: FloatArray
-    weights: FloatArray
-    residuals_m: FloatArray
-    slope: float
-    target: IntArray
-
-
-def information_of(evidence: Evidence, surface: Surface, settings: IcpSettings) -> tuple[FloatArray, FloatArray]:
-    """Information (p, p) at the source origin, and free unit directions (k, p), of a weighted least-squares solution.
-
-    The covariance is H^-1 M H^-1 (Huber 1967; White 1980) with M the outer products of the scores of the source
-    points, plus those of the target points, whose noise reaches every pair that leans on them. With independent
-    residuals of one variance that is sigma^2 H^-1. Free directions get `free_sigma_m`.
-    """
-    weighted = evidence.jacobian * evidence.weights[:, None]
-    basis, values, free = split_directions(evidence.jacobian.T @ weighted, settings.degeneracy_ratio)
-    scores = weighted @ basis
-    thickness = surface.thickness_m[evidence.target]
-    by_pair = evidence.slope * scores * _sigma(thickness, settings)  # a score follows noise with the loss's curvature
-    by_target = scores_of_targets(by_pair, evidence.target, surface.neighbours, surface.normals)
-    by_source = scores * _sigma(evidence.residuals_m, settings)
-    k = surface.neighbours.shape[1]  # the residuals hold the noise of an anchor too, 1/k of a point's
-    middle = by_source.T @ by_source * (k / (k + 1)) + by_target.T @ by_target
-    freedom = len(scores) / max(len(scores) - len(values), 1)
-    inverse = 1.0 / (evidence.slope * values)
-    covariance = freedom * inverse[:, None] * middle * inverse
-    floor = 1.0 / settings.free_sigma_m**2
-    held_values, held_vectors = np.linalg.eigh(covariance)
-    held = basis @ held_vectors
-    balanced = (held * np.maximum(1.0 / held_values, floor)) @ held.T + floor * free @ free.T
-    from_origin = np.linalg.inv(evidence.frame.to_origin)
-    information = from_origin.T @ balanced @ from_origin
-    directions = (evidence.frame.to_origin @ free).T
-    return (information + information.T) / 2, directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _sigma(deviation_m: FloatArray, settings: IcpSettings) -> FloatArray:
-    """Deviations (m,) no smaller than the floor, as a column."""
-    return np.maximum(deviation_m, settings.sigma_floor_m)[:, None]
+from posegraph_slam.registration.compiled_loop import (
+    GENERALISED,
+    MEDIAN_1,
+    MEDIAN_2,
+    MEDIAN_3,
+    PLANE,
+    POINT,
+    flat_metric,
+)
+from posegraph_slam.registration.small_steps import centre_and_radius, robust_slope, robust_weight, tangent_row
 
 
 @kernel
-def scores_of_targets(scores: FloatArray, target: IntArray, neighbours: IntArray, normals: FloatArray) -> FloatArray:
-    """Score (n, k) of each target point's noise along its normal, from those of the pairs (m, k) that lean on it.
+def describe_pairs(
+    d: int, T: FloatArray, source: FloatArray, target: FloatArray, anchors: FloatArray, normals: FloatArray,
+    trust: FloatArray, thickness: FloatArray, neighbours: IntArray, source_normals: FloatArray, s: IntArray,
+    t: IntArray, residual: int, loss: int, options: FloatArray,
+) -> tuple[FloatArray, FloatArray, int, float]:  # fmt: skip
+    """Information (p, p) at the source origin, eigenvectors (p, p) of which the first few are free, how many, and RMSE.
 
-    A pair with target point t leans in equal shares on `neighbours[t]`; noise along the normal n_j of one of them
-    moves its residual by n_t . n_j, which also settles the arbitrary signs of the normals.
+    The covariance is H^-1 M H^-1 (Huber 1967; White 1980), in a frame about the pairs' centre in which turns are
+    measured on their radius. M sums the outer products of the scores of the source points, each with its own residual,
+    and of the target points, each of which moves every pair that leans on it. With independent residuals of one
+    variance that is sigma^2 H^-1. Directions whose share of H is under the ratio are free and get `free_sigma_m`.
     """
-    result = np.zeros((neighbours.shape[0], scores.shape[1]))
+    scale_given, floor, ratio, plane_share = options[2], options[5], options[7], options[8]
+    sigma_floor, free_sigma = options[9], options[10]
+    count, p = len(s), 3 * (d - 1)
+    centre, radius = centre_and_radius(source, s, count, d)
+    jacobian, offset, length, weight = np.zeros((count, p)), np.zeros(count), np.zeros(count), np.zeros(count)
+    gaps, gap, arm, n, metric = np.zeros((count, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    for k in range(count):
+        square = 0.0
+        for a in range(d):
+            moved = T[a, 3]
+            for b in range(d):
+                moved += T[a, b] * source[s[k], b]
+            gaps[k, a] = moved - anchors[t[k], a]
+            gap[a] = moved - target[t[k], a]
+            square += gap[a] ** 2
+            arm[a] = (source[s[k], a] - centre[a]) / radius
+            offset[k] += (gap[a] if residual == GENERALISED else gaps[k, a]) * normals[t[k], a]
+            n[a] = 0.0
+            for b in range(d):
+                n[a] += T[b, a] * normals[t[k], b]
+        tangent_row(d, arm, n, jacobian[k])
+        weight[k] = 1.0
+        if residual == POINT:
+            length[k] = np.sqrt(square)
+        elif residual == PLANE:
+            length[k], weight[k] = abs(offset[k]), trust[t[k]]
+        else:
+            for a in range(3):
+                arm[a] = T[a, 0] * source_normals[s[k], 0] + T[a, 1] * source_normals[s[k], 1]
+                arm[a] += T[a, 2] * source_normals[s[k], 2]
+            flat_metric(d, normals[t[k]], arm, plane_share, metric)
+            square, flatness = 0.0, 0.0
+            for a in range(d):
+                for b in range(d):
+                    square += gap[a] * metric[a, b] * gap[b]
+                    flatness += normals[t[k], a] * metric[a, b] * normals[t[k], b]
+            length[k], weight[k] = np.sqrt(square), flatness
+    known, total, squares = 0.0, 0.0, 0.0
+    for k in range(count):
+        total += weight[k]
+        squares += weight[k] * length[k] ** 2 if residual != GENERALISED else length[k] ** 2
+    rmse = np.sqrt(squares / max(count if residual == GENERALISED else total, 1e-300))
+    scale = scale_given
+    if scale <= 0 and loss != 0:
+        middle = count // 2
+        median = MEDIAN_1 if residual != POINT else (MEDIAN_2 if d == 2 else MEDIAN_3)
+        scale = max(np.partition(length, middle)[middle] / median, floor)
+    slope = 1.0
+    if loss != 0:
+        bent, total = 0.0, 0.0
+        for k in range(count):
+            bent += weight[k] * robust_slope(loss, length[k] / scale)
+            weight[k] *= robust_weight(loss, length[k] / scale)
+            total += weight[k]
+        slope = max(bent / (total + 1e-300), 0.1)
+    H = np.zeros((p, p))
+    for k in range(count):
+        for a in range(p):
+            for b in range(p):
+                H[a, b] += weight[k] * jacobian[k, a] * jacobian[k, b]
+    values, vectors = np.linalg.eigh(H)
+    free = 0
+    while free < p and values[free] <= max(ratio * values[p - 1], 2.2250738585072014e-308):
+        free += 1
+    held = p - free
+    scores = np.zeros((count, held))
+    for k in range(count):
+        for j in range(held):
+            for a in range(p):
+                scores[k, j] += weight[k] * jacobian[k, a] * vectors[a, free + j]
+    middle_part = score_products(d, scores, offset, length, gaps, thickness, anchors, target, normals, neighbours, t,
+                                 residual, slope, sigma_floor)  # fmt: skip
+    freedom = count / max(count - held, 1)
+    covariance = np.zeros((held, held))
+    for i in range(held):
+        for j in range(held):
+            covariance[i, j] = freedom * middle_part[i, j] / (slope**2 * values[free + i] * values[free + j])
+    information = np.zeros((p, p))
+    lowest = 1.0 / free_sigma**2
+    for j in range(free):
+        for a in range(p):
+            for b in range(p):
+                information[a, b] += lowest * vectors[a, j] * vectors[b, j]
+    if held > 0:
+        held_values, held_vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+        for j in range(held):
+            known = max(1.0 / max(held_values[j], 1e-300), lowest)
+            axis = np.zeros(p)
+            for i in range(held):
+                for a in range(p):
+                    axis[a] += vectors[a, free + i] * held_vectors[i, j]
+            for a in range(p):
+                for b in range(p):
+                    information[a, b] += known * axis[a] * axis[b]
+    return to_origin(d, information, centre, radius), free_at_origin(d, vectors, free, centre, radius), free, rmse
+
+
+@kernel
+def score_products(
+    d: int, scores: FloatArray, offset: FloatArray, length: FloatArray, gaps: FloatArray, thickness: FloatArray,
+    anchors: FloatArray, target: FloatArray, normals: FloatArray, neighbours: IntArray, t: IntArray, residual: int,
+    slope: float, sigma_floor: float,
+) -> FloatArray:  # fmt: skip
+    """Sum M (h, h) of the outer products of all points' scores, each times the deviation of its point.
+
+    The line or plane at a target is the regression on its k neighbours: with their places u_j in it about the anchor,
+    of covariance C, one of them moves the residual of a source point at u by (1 + u C^-1 u_j) / k times its own noise,
+    which counts as far as the normals agree. Raw pairs hold the target's noise in their residuals already; those that
+    share a target are summed first.
+    """
+    count, held = scores.shape
+    k_all = neighbours.shape[1]
+    leaning = np.zeros((len(target), held))
+    M = np.zeros((held, held))
+    if residual == GENERALISED:
+        for k in range(count):
+            sigma = offset[k] if abs(offset[k]) > sigma_floor else (sigma_floor if offset[k] >= 0 else -sigma_floor)
+            for a in range(held):
+                leaning[t[k], a] += scores[k, a] * sigma
+    else:
+        inverse, gap = np.zeros((3, 3)), np.zeros(3)
+        for k in range(count):
+            sigma = max(length[k], sigma_floor)
+            for a in range(held):
+                for b in range(held):
+                    M[a, b] += scores[k, a] * scores[k, b] * sigma * sigma * k_all / (k_all + 1)
+            sigma = slope * max(thickness[t[k]], sigma_floor)
+            reach = residual == PLANE
+            if reach:
+                tangent_inverse(d, target, anchors[t[k]], normals[t[k]], neighbours[t[k]], inverse)
+                for a in range(d):
+                    gap[a] = 0.0
+                    for b in range(d):
+                        gap[a] += inverse[a, b] * gaps[k, b]
+            for j in neighbours[t[k]]:
+                share, lever = 0.0, 1.0
+                for a in range(d):
+                    share += normals[t[k], a] * normals[j, a]
+                    if reach:
+                        lever += gap[a] * (target[j, a] - anchors[t[k], a])
+                share *= sigma * lever / k_all
+                for a in range(held):
+                    leaning[j, a] += share * scores[k, a]
     for row in range(len(target)):
-        t = target[row]
-        for j in neighbours[t]:
-            share = 0.0
-            for a in range(normals.shape[1]):
-                share += normals[t, a] * normals[j, a]
-            share /= neighbours.shape[1]
-            for a in range(scores.shape[1]):
-                result[j, a] += share * scores[row, a]
+        for a in range(held):
+            for b in range(held):
+                M[a, b] += leaning[row, a] * leaning[row, b]
+    return M
+
+
+@kernel
+def tangent_inverse(
+    d: int, points: FloatArray, anchor: FloatArray, n: FloatArray, near: IntArray, inverse: FloatArray
+) -> None:
+    """Write the inverse (3, 3) of the covariance of the neighbours within their line or plane, zero across it.
+
+    A tenth of its trace is added: a lever that a row of points hardly holds is not stretched without limit.
+    """
+    inverse[:] = 0.0
+    first, second = np.zeros(3), np.zeros(3)
+    if d == 2:
+        first[0], first[1] = -n[1], n[0]
+    else:
+        least = 0
+        for a in range(1, 3):
+            if abs(n[a]) < abs(n[least]):
+                least = a
+        helper = np.zeros(3)
+        helper[least] = 1.0
+        first[0], first[1], first[2] = (
+            n[1] * helper[2] - n[2] * helper[1], n[2] * helper[0] - n[0] * helper[2],
+            n[0] * helper[1] - n[1] * helper[0],
+        )  # fmt: skip
+        first /= max(np.sqrt(first[0] ** 2 + first[1] ** 2 + first[2] ** 2), 1e-300)
+        second[0], second[1], second[2] = (
+            n[1] * first[2] - n[2] * first[1], n[2] * first[0] - n[0] * first[2], n[0] * first[1] - n[1] * first[0],
+        )  # fmt: skip
+    xx, xy, yy = 0.0, 0.0, 0.0
+    for j in near:
+        x, y = 0.0, 0.0
+        for a in range(d):
+            x += (points[j, a] - anchor[a]) * first[a]
+            y += (points[j, a] - anchor[a]) * second[a]
+        xx += x * x / len(near)
+        xy += x * y / len(near)
+        yy += y * y / len(near)
+    if d == 2:
+        if xx > 0:
+            for a in range(2):
+                for b in range(2):
+                    inverse[a, b] = first[a] * first[b] / xx
+        return
+    damping = 0.05 * (xx + yy)
+    xx += damping
+    yy += damping
+    det = xx * yy - xy * xy
+    if det > 0:
+        for a in range(3):
+            for b in range(3):
+                inverse[a, b] = (
+                    yy * first[a] * first[b] - xy * (first[a] * second[b] + second[a] * first[b])
+                    + xx * second[a] * second[b]
+                ) / det  # fmt: skip
+
+
+@kernel
+def frame_matrix(d: int, centre: FloatArray, radius: float, forward: bool) -> FloatArray:
+    """Matrix (p, p) from tangents about `centre`, turns measured on `radius`, to those at the origin, or backwards.
+
+    It is the adjoint of the shift to the centre: a turn w there is a turn w and a shift centre x w at the origin.
+    """
+    p = 3 * (d - 1)
+    A = np.eye(p)
+    sign, unit = (1.0, 1.0 / radius) if forward else (-1.0, radius)
+    lever = unit if forward else 1.0
+    if d == 2:
+        A[2, 2] = unit
+        A[0, 2], A[1, 2] = sign * centre[1] * lever, -sign * centre[0] * lever
+        return A
+    hat = np.array([[0.0, -centre[2], centre[1]], [centre[2], 0.0, -centre[0]], [-centre[1], centre[0], 0.0]])
+    for a in range(3):
+        A[a, a] = unit
+        for b in range(3):
+            A[3 + a, b] = sign * hat[a, b] * lever
+    return A
+
+
+@kernel
+def to_origin(d: int, information: FloatArray, centre: FloatArray, radius: float) -> FloatArray:
+    """Information (p, p) of the tangent at the source origin from that of the balanced frame."""
+    back = frame_matrix(d, centre, radius, False)
+    result = back.T @ information @ back
+    return (result + result.T) / 2
+
+
+@kernel
+def free_at_origin(d: int, vectors: FloatArray, free: int, centre: FloatArray, radius: float) -> FloatArray:
+    """Unit tangents (free, p) at the source origin of the first `free` eigenvectors (p, p)."""
+    forward = frame_matrix(d, centre, radius, True)
+    result = np.zeros((free, len(vectors)))
+    for j in range(free):
+        size = 0.0
+        for a in range(len(vectors)):
+            for b in range(len(vectors)):
+                result[j, a] += forward[a, b] * vectors[b, j]
+            size += result[j, a] ** 2
+        result[j] /= np.sqrt(size)
     return result

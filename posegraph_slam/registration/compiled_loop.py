@@ -1,0 +1,300 @@
+"""The closest point loop as one kernel: what `icp` runs when no part of it is exchanged for another."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.jit import kernel
+from posegraph_slam.registration.kd_tree import STACK, nearest_two
+from posegraph_slam.registration.robust import MEDIAN_OF_NORM
+from posegraph_slam.registration.small_steps import (
+    best_rigid,
+    centre_and_radius,
+    robust_weight,
+    tangent_row,
+    update_about,
+)
+
+POINT, PLANE, GENERALISED = 0, 1, 2
+CONVERGED, MAX_ITERATIONS, TOO_FEW_INLIERS, DEGENERATE = 0, 1, 2, 3
+
+MEDIAN_1, MEDIAN_2, MEDIAN_3 = MEDIAN_OF_NORM[1], MEDIAN_OF_NORM[2], MEDIAN_OF_NORM[3]
+
+
+@kernel
+def run_loop(
+    d: int, source: FloatArray, target: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray,
+    value: FloatArray, anchors: FloatArray, normals: FloatArray, trust: FloatArray, source_normals: FloatArray,
+    start: FloatArray, residual: int, loss: int, options: FloatArray,
+) -> tuple[FloatArray, int, int, IntArray, IntArray]:  # fmt: skip
+    """Register source (n, 3) onto target (m, 3): pose (4, 4), status, rounds, and the rows (k,) of the last pairs.
+
+    `options` as `options_of` gives them. A pose that comes back, within the tolerances, to one of an earlier round
+    runs in a circle of pairings (Brent 1980 finds it): it is as settled as it will be.
+    """
+    gate, keep, scale_given, rounds, turn_limit, move_limit = options[:6]
+    least_pairs, ratio, plane_share = options[6], options[7], options[8]
+    n = len(source)
+    T, remembered, power, lap = start.copy(), start.copy(), 1, 0
+    partner, spare, moved = np.full(n, -1, dtype=np.int64), np.zeros(n), np.zeros((n, 3))
+    s, t = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    square, weight, length = np.empty(n), np.empty(n), np.empty(n)
+    stack, bounds = np.zeros((STACK, 3), dtype=np.int64), np.zeros((STACK, 4))
+    for iteration in range(1, int(rounds) + 1):
+        count = pair_nearest(d, T, source, target, rows, leaves, axis, value, gate, partner, spare, moved, s, t, square,
+                             stack, bounds)  # fmt: skip
+        if residual != POINT:
+            count = with_normals(d, normals, s, t, square, count)
+        if keep < 1 and count > 0:
+            count = trim(keep, s, t, square, count)
+        if count < least_pairs:
+            return T, TOO_FEW_INLIERS, iteration, s[:count], t[:count]
+        if residual == POINT:
+            for k in range(count):
+                length[k], weight[k] = np.sqrt(square[k]), 1.0
+            weigh(loss, length, weight, count, scale_given, MEDIAN_2 if d == 2 else MEDIAN_3, move_limit)
+            better, good = best_rigid(source, target, s, t, weight, count, d)
+        elif residual == PLANE:
+            for k in range(count):
+                offset = 0.0
+                for a in range(d):
+                    offset += (moved[s[k], a] - anchors[t[k], a]) * normals[t[k], a]
+                square[k] = offset
+                length[k], weight[k] = abs(offset), trust[t[k]]
+            weigh(loss, length, weight, count, scale_given, MEDIAN_1, move_limit)
+            better, good = plane_step(d, T, source, normals, s, t, square, weight, count, ratio)
+        else:
+            better, good = generalised_step(
+                d, T, source, target, moved, normals, source_normals, s, t, length, weight, count, ratio, plane_share,
+                loss, scale_given, move_limit)  # fmt: skip
+        if not good:
+            return T, DEGENERATE, iteration, s[:count], t[:count]
+        settled = is_near(T, better, turn_limit, move_limit) or (
+            iteration > 2 and is_near(remembered, better, turn_limit, move_limit)
+        )
+        T = better
+        if settled:
+            return T, CONVERGED, iteration, s[:count].copy(), t[:count].copy()
+        lap += 1
+        if lap == power:
+            remembered, power, lap = T, 2 * power, 0
+    return T, MAX_ITERATIONS, int(rounds), s[:count].copy(), t[:count].copy()
+
+
+@kernel
+def is_near(a: FloatArray, b: FloatArray, turn_limit: float, move_limit: float) -> bool:
+    """Whether two poses (4, 4) differ by less than a turn and a shift."""
+    turned, moved = 0.0, 0.0
+    for i in range(3):
+        moved += (a[i, 3] - b[i, 3]) ** 2
+        for j in range(3):
+            turned += (a[i, j] - b[i, j]) ** 2
+    turn = 2.0 * np.arcsin(min(np.sqrt(turned / 8.0), 1.0))
+    return bool(np.sqrt(moved) < move_limit and turn < turn_limit)
+
+
+@kernel
+def pair_nearest(
+    d: int, T: FloatArray, source: FloatArray, target: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray,
+    value: FloatArray, gate: float, partner: IntArray, spare: FloatArray, moved: FloatArray, s: IntArray, t: IntArray,
+    square: FloatArray, stack: IntArray, bounds: FloatArray,
+) -> int:  # fmt: skip
+    """Move the source and pair it with the nearest targets within the gate; number of pairs.
+
+    `spare` (n,) is how near any target but the partner may be: the distance of the second nearest when it was last
+    searched, less all motion since. While the partner is nearer than that nothing needs to be searched (triangle
+    inequality, as in Elkan 2003 for clusters); else it starts the search.
+    """
+    count = 0
+    place = np.zeros(3)
+    for k in range(len(source)):
+        shift = 0.0
+        for a in range(d):
+            place[a] = T[a, 3]
+            for b in range(d):
+                place[a] += T[a, b] * source[k, b]
+            shift += (place[a] - moved[k, a]) ** 2
+            moved[k, a] = place[a]
+        best, best_square = -1, gate * gate
+        if partner[k] >= 0:
+            before = 0.0
+            for a in range(d):
+                before += (place[a] - target[partner[k], a]) ** 2
+            if before <= best_square:
+                best, best_square = partner[k], before
+            spare[k] -= np.sqrt(shift)
+        if best < 0 or not (spare[k] > 0 and best_square < spare[k] ** 2 * (1 - 1e-12)):
+            best, best_square, second = nearest_two(place[0], place[1], place[2], rows, leaves, axis, value, best,
+                                                    best_square, gate * gate, stack, bounds)  # fmt: skip
+            spare[k] = np.sqrt(second)
+        partner[k] = best
+        if best >= 0:
+            s[count], t[count], square[count] = k, best, best_square
+            count += 1
+    return count
+
+
+@kernel
+def with_normals(d: int, normals: FloatArray, s: IntArray, t: IntArray, square: FloatArray, count: int) -> int:
+    """Keep the pairs whose target has a normal; number of them."""
+    kept = 0
+    for k in range(count):
+        size = 0.0
+        for a in range(d):
+            size += abs(normals[t[k], a])
+        if size > 0:
+            s[kept], t[kept], square[kept] = s[k], t[k], square[k]
+            kept += 1
+    return kept
+
+
+@kernel
+def trim(keep: float, s: IntArray, t: IntArray, square: FloatArray, count: int) -> int:
+    """Keep the nearest share of the pairs, of equals the first; number of them."""
+    wanted = min(max(int(np.round(keep * count)), 1), count)
+    limit = np.partition(square[:count], wanted - 1)[wanted - 1]
+    nearer = 0
+    for k in range(count):
+        nearer += square[k] < limit
+    ties, kept = wanted - nearer, 0
+    for k in range(count):
+        tied = square[k] == limit
+        if square[k] < limit or (tied and ties > 0):
+            ties -= tied
+            s[kept], t[kept], square[kept] = s[k], t[k], square[k]
+            kept += 1
+    return kept
+
+
+@kernel
+def weigh(
+    loss: int, length: FloatArray, weight: FloatArray, count: int, scale_given: float, median_of_norm: float,
+    floor: float,
+) -> float:  # fmt: skip
+    """Multiply the weights of the pairs by those of the loss; the scale it used."""
+    if loss == 0:
+        return 1.0
+    scale = scale_given
+    if scale <= 0:
+        middle = count // 2
+        scale = max(np.partition(length[:count], middle)[middle] / median_of_norm, floor)
+    for k in range(count):
+        weight[k] *= robust_weight(loss, length[k] / scale)
+    return scale
+
+
+@kernel
+def solve_held(H: FloatArray, g: FloatArray, ratio: float) -> tuple[FloatArray, bool]:
+    """Step (p,) that minimises along the eigenvectors of H that are held; others get none. False if none is held."""
+    values, vectors = np.linalg.eigh(H)
+    p = len(g)
+    step, limit, held = np.zeros(p), max(ratio * values[p - 1], 2.2250738585072014e-308), False
+    for j in range(p):
+        if values[j] > limit:
+            held = True
+            along = 0.0
+            for a in range(p):
+                along += vectors[a, j] * g[a]
+            for a in range(p):
+                step[a] -= vectors[a, j] * along / values[j]
+    return step, held
+
+
+@kernel
+def plane_step(
+    d: int, T: FloatArray, source: FloatArray, normals: FloatArray, s: IntArray, t: IntArray, offset: FloatArray,
+    weight: FloatArray, count: int, ratio: float,
+) -> tuple[FloatArray, bool]:  # fmt: skip
+    """One Gauss-Newton step on the distances (count,) to the targets' lines or planes (Chen and Medioni 1992)."""
+    p = 3 * (d - 1)
+    centre, radius = centre_and_radius(source, s, count, d)
+    H, g, row, arm, n = np.zeros((p, p)), np.zeros(p), np.zeros(p), np.zeros(3), np.zeros(3)
+    for k in range(count):
+        for a in range(d):
+            arm[a] = (source[s[k], a] - centre[a]) / radius
+            n[a] = 0.0
+            for b in range(d):
+                n[a] += T[b, a] * normals[t[k], b]
+        tangent_row(d, arm, n, row)
+        for a in range(p):
+            g[a] += weight[k] * row[a] * offset[k]
+            for b in range(a + 1):
+                H[a, b] += weight[k] * row[a] * row[b]
+    for a in range(p):
+        for b in range(a):
+            H[b, a] = H[a, b]
+    step, held = solve_held(H, g, ratio)
+    return update_about(T, centre, step, radius, d), held
+
+
+@kernel
+def flat_metric(d: int, n: FloatArray, m: FloatArray, share: float, M: FloatArray) -> None:
+    """Write 2 share (C_n + C_m)^-1 (3, 3), C of variance 1 along and `share` across a line or plane with that normal.
+
+    A shift along two equal normals then counts once, one along their plane `share` times.
+    """
+    A = np.zeros((3, 3))
+    for a in range(3):
+        for b in range(3):
+            A[a, b] = -(1.0 - share) * (n[a] * n[b] + m[a] * m[b])
+        A[a, a] += 2.0
+    det = (
+        A[0, 0] * (A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1])
+        - A[0, 1] * (A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0])
+        + A[0, 2] * (A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0])
+    )
+    f = 2.0 * share / det
+    M[0, 0], M[1, 1], M[2, 2] = (
+        f * (A[1, 1] * A[2, 2] - A[1, 2] ** 2), f * (A[0, 0] * A[2, 2] - A[0, 2] ** 2),
+        f * (A[0, 0] * A[1, 1] - A[0, 1] ** 2),
+    )  # fmt: skip
+    M[0, 1] = M[1, 0] = f * (A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2])
+    M[0, 2] = M[2, 0] = f * (A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1])
+    M[1, 2] = M[2, 1] = f * (A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2])
+
+
+@kernel
+def generalised_step(
+    d: int, T: FloatArray, source: FloatArray, target: FloatArray, moved: FloatArray, normals: FloatArray,
+    source_normals: FloatArray, s: IntArray, t: IntArray, length: FloatArray, weight: FloatArray, count: int,
+    ratio: float, plane_share: float, loss: int, scale_given: float, floor: float,
+) -> tuple[FloatArray, bool]:  # fmt: skip
+    """One Gauss-Newton step of generalised ICP: shifts in the metric of both neighbourhoods (Segal et al. 2009)."""
+    p = 3 * (d - 1)
+    centre, radius = centre_and_radius(source, s, count, d)
+    metric, shift, m = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(3)
+    for k in range(count):
+        for a in range(3):
+            m[a] = 0.0
+            shift[k, a] = moved[s[k], a] - target[t[k], a]
+            for b in range(3):
+                m[a] += T[a, b] * source_normals[s[k], b]
+        flat_metric(d, normals[t[k]], m, plane_share, metric[k])
+        square = 0.0
+        for a in range(d):
+            for b in range(d):
+                square += shift[k, a] * metric[k, a, b] * shift[k, b]
+        length[k], weight[k] = np.sqrt(square), 1.0
+    weigh(loss, length, weight, count, scale_given, MEDIAN_1, floor)
+    H, g, rows, arm, n = np.zeros((p, p)), np.zeros(p), np.zeros((3, p)), np.zeros(3), np.zeros(3)
+    pulled = np.zeros((3, p))
+    for k in range(count):
+        for a in range(d):
+            arm[a] = (source[s[k], a] - centre[a]) / radius
+        for c in range(d):  # the shift along axis c of the target
+            for a in range(d):
+                n[a] = T[c, a]
+            tangent_row(d, arm, n, rows[c])
+        for c in range(d):
+            for a in range(p):
+                pulled[c, a] = 0.0
+                for e in range(d):
+                    pulled[c, a] += weight[k] * metric[k, c, e] * rows[e, a]
+        for a in range(p):
+            for c in range(d):
+                g[a] += pulled[c, a] * shift[k, c]
+                for b in range(p):
+                    H[a, b] += pulled[c, a] * rows[c, b]
+    step, held = solve_held((H + H.T) / 2, g, ratio)
+    return update_about(T, centre, step, radius, d), held

@@ -1,0 +1,133 @@
+"""Rigid steps of one registration round on 4 x 4 poses, in kernels; the plane is space without its third axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.jit import kernel
+
+
+@kernel
+def robust_weight(loss: int, u: float) -> float:
+    """Weight of a residual of u standard deviations: 0 none, 1 Huber, 2 Cauchy, 3 Geman-McClure, 4 Tukey."""
+    if loss == 1:
+        return 1.345 / max(u, 1.345)
+    if loss == 2:
+        return 1.0 / (1.0 + (u / 2.3849) ** 2)
+    if loss == 3:
+        return 1.0 / (1.0 + (u / 3.7874) ** 2) ** 2
+    if loss == 4:
+        return max(1.0 - (u / 4.6851) ** 2, 0.0) ** 2
+    return 1.0
+
+
+@kernel
+def robust_slope(loss: int, u: float) -> float:
+    """Curvature of the loss at u standard deviations, in the order of `robust_weight`."""
+    if loss == 1:
+        return 1.0 if u <= 1.345 else 0.0
+    if loss == 2:
+        x = (u / 2.3849) ** 2
+        return (1.0 - x) / (1.0 + x) ** 2
+    if loss == 3:
+        x = (u / 3.7874) ** 2
+        return (1.0 - 3.0 * x) / (1.0 + x) ** 3
+    if loss == 4:
+        x = min((u / 4.6851) ** 2, 1.0)
+        return (1.0 - x) * (1.0 - 5.0 * x)
+    return 1.0
+
+
+@kernel
+def tangent_row(d: int, arm: FloatArray, n: FloatArray, row: FloatArray) -> None:
+    """Write the derivative (p,) of a distance along n for a right update about the point that `arm` starts from."""
+    if d == 2:
+        row[0], row[1], row[2] = n[0], n[1], arm[0] * n[1] - arm[1] * n[0]
+        return
+    row[0], row[1], row[2] = arm[1] * n[2] - arm[2] * n[1], arm[2] * n[0] - arm[0] * n[2], arm[0] * n[1] - arm[1] * n[0]
+    row[3], row[4], row[5] = n[0], n[1], n[2]
+
+
+@kernel
+def centre_and_radius(points: FloatArray, chosen: IntArray, count: int, d: int) -> tuple[FloatArray, float]:
+    """Mean (3,) and root mean square radius of rows `chosen[:count]` of points (n, 3)."""
+    centre, square = np.zeros(3), 0.0
+    for k in range(count):
+        for a in range(d):
+            centre[a] += points[chosen[k], a] / count
+    for k in range(count):
+        for a in range(d):
+            square += (points[chosen[k], a] - centre[a]) ** 2 / count
+    return centre, max(np.sqrt(square), 1e-9)
+
+
+@kernel
+def update_about(T: FloatArray, centre: FloatArray, step: FloatArray, radius: float, d: int) -> FloatArray:
+    """T (4, 4) after the right update of `step` (p,) about `centre`, turns measured on `radius`: T S exp(step) S^-1."""
+    turn, move = np.zeros(3), np.zeros(3)
+    if d == 2:
+        turn[2], move[0], move[1] = step[2] / radius, step[0], step[1]
+    else:
+        for a in range(3):
+            turn[a], move[a] = step[a] / radius, step[3 + a]
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    if angle > 1e-4:
+        s, c, e = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    else:
+        s, c, e = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1.0 / 6 - angle**2 / 120
+    K = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+    KK = K @ K
+    R, V = np.eye(3) + s * K + c * KK, np.eye(3) + c * K + e * KK
+    shift = V @ move + centre - R @ centre
+    result = np.eye(4)
+    for a in range(3):
+        result[a, 3] = T[a, 3]
+        for b in range(3):
+            result[a, 3] += T[a, b] * shift[b]
+            result[a, b] = T[a, 0] * R[0, b] + T[a, 1] * R[1, b] + T[a, 2] * R[2, b]
+    return result
+
+
+@kernel
+def best_rigid(
+    source: FloatArray, target: FloatArray, s: IntArray, t: IntArray, w: FloatArray, count: int, d: int
+) -> tuple[FloatArray, bool]:
+    """Pose (4, 4) that aligns `count` weighted pairs of rows, and whether it is the only one (Kabsch 1976)."""
+    total, mean_s, mean_t = 0.0, np.zeros(3), np.zeros(3)
+    for k in range(count):
+        total += w[k]
+        for a in range(d):
+            mean_s[a] += w[k] * source[s[k], a]
+            mean_t[a] += w[k] * target[t[k], a]
+    T = np.eye(4)
+    if total <= 0:
+        return T, False
+    mean_s /= total
+    mean_t /= total
+    Q = np.zeros((3, 3))
+    for k in range(count):
+        for a in range(d):
+            for b in range(d):
+                Q[a, b] += w[k] * (target[t[k], a] - mean_t[a]) * (source[s[k], b] - mean_s[b])
+    if d == 2:  # the reflection cannot win: the closed form knows rotations alone
+        cosine, sine = Q[0, 0] + Q[1, 1], Q[1, 0] - Q[0, 1]
+        length = np.hypot(cosine, sine)
+        largest = 0.5 * (length + np.hypot(Q[0, 0] - Q[1, 1], Q[1, 0] + Q[0, 1]))
+        if not length > 1e-9 * largest:
+            return T, False
+        T[0, 0] = T[1, 1] = cosine / length
+        T[1, 0], T[0, 1] = sine / length, -sine / length
+    else:
+        U, S, Vt = np.linalg.svd(Q)
+        sign = 1.0 if np.linalg.det(U) * np.linalg.det(Vt) > 0 else -1.0
+        if not S[1] + sign * S[2] > 1e-9 * S[0]:
+            return T, False
+        for a in range(3):
+            for b in range(3):
+                T[a, b] = U[a, 0] * Vt[0, b] + U[a, 1] * Vt[1, b] + sign * U[a, 2] * Vt[2, b]
+    for a in range(d):
+        T[a, 3] = mean_t[a]
+        for b in range(d):
+            T[a, 3] -= T[a, b] * mean_s[b]
+    return T, True
