@@ -12,7 +12,7 @@ from posegraph_slam.jit import kernel
 from posegraph_slam.localization.slam_settings import ParticleSlamSettings
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
-from posegraph_slam.mapping.raycast import FRACTION_BITS, NEVER_SEEN, fixed_point, next_cell, plan_walk
+from posegraph_slam.mapping.raycast import FRACTION_BITS, NEVER_SEEN, fixed_point, plan_walk
 
 UNITS_A_STEP = 1024
 """Whole units of a miss's log-odds: sums are exact."""
@@ -69,14 +69,16 @@ def empty_map(geometry: GridGeometry, settings: ParticleSlamSettings) -> SlamMap
 def draw_scan(slam_map: SlamMap, points: FloatArray, pose: FloatArray, sensor: FloatArray) -> None:
     """Add a scan's returns `points` (n, 2) (base frame), seen from `sensor` (2,), at `pose` (3,), by exact rays.
 
-    A cell changes at most once; a hit wins over misses.
+    A cell changes at most once; a hit wins over misses. Of the beams that end in one cell the first is walked: the
+    others cross the same cells but for slivers, and near surfaces are hit five times a cell.
     """
     slam_map.mark = slam_map.mark % 255 + 1
     if slam_map.mark == 1:
         slam_map.stamps[:] = 0
     changes = np.empty((4096, 2), dtype=np.int64)
     M = slam_map.geometry.cells_from_map @ _matrix(pose)
-    count = add_scan(points, M, sensor, slam_map.steps, slam_map.evidence, slam_map.stamps, slam_map.mark, changes)
+    mark = np.uint8(slam_map.mark)
+    count = add_scan(points, M, sensor, slam_map.steps, slam_map.evidence, slam_map.stamps, mark, changes)
     refresh_near(
         changes[: min(count, len(changes))], slam_map.evidence, slam_map.steps[3], slam_map.reach, slam_map.near
     )
@@ -103,19 +105,23 @@ def add_scan(points, M, sensor, steps, evidence, stamps, mark, changes):  # type
     rows, columns = evidence.shape
     total, marks = evidence.reshape(rows * columns), stamps.reshape(rows * columns)
     start, end = np.empty(2, dtype=np.int64), np.empty(2, dtype=np.int64)
-    count = 0
-    hit, miss, clamp, above = steps[0], steps[1], steps[2], steps[3]
+    count, walked = 0, 0
+    rays = np.empty(len(points), dtype=np.int64)
+    hit, miss, clamp, above = np.int32(steps[0]), np.int32(steps[1]), np.int32(steps[2]), np.int32(steps[3])
     for b in range(len(points)):
         fixed_point(M, points[b, 0], points[b, 1], end)
         column, row = end[0] >> FRACTION_BITS, end[1] >> FRACTION_BITS
         if 0 <= row < rows and 0 <= column < columns and stamps[row, column] != mark:
             at = row * columns + column
             marks[at] = mark
+            rays[walked] = b
+            walked += 1
             if change_cell(total, at, hit, clamp, above) != 0 and count < len(changes):
                 changes[count, 0], changes[count, 1] = row, column
                 count += 1
     fixed_point(M, sensor[0], sensor[1], start)
-    for b in range(len(points)):
+    for k in range(walked):
+        b = rays[k]
         fixed_point(M, points[b, 0], points[b, 1], end)
         low = min(start[0], start[1], end[0], end[1]) >> FRACTION_BITS
         high_column = max(start[0], end[0]) >> FRACTION_BITS
@@ -123,8 +129,8 @@ def add_scan(points, M, sensor, steps, evidence, stamps, mark, changes):  # type
         if low < 0 or high_column >= columns or high_row >= rows:
             continue  # the grid is made so large that only a pose far astray gets here
         walk = plan_walk(start, end, columns)
-        index, lead = walk.first, walk.lead
-        while index != walk.last:
+        index, lead, last = walk.first, walk.lead, walk.last
+        while index != last:
             at = np.uint64(index)  # unsigned, or every access is checked for being negative
             if marks[at] != mark:
                 marks[at] = mark
@@ -135,7 +141,16 @@ def add_scan(points, M, sensor, steps, evidence, stamps, mark, changes):  # type
                 if old > above and new <= above and count < len(changes):
                     changes[count, 0], changes[count, 1] = index // columns, index % columns
                     count += 1
-            index, lead = next_cell(walk, index, lead)
+            # `next_cell` written out: branches predict well along a ray and cost a tenth less here than selections.
+            if lead < 0:
+                index += walk.step_column
+                lead += walk.height
+            elif lead > 0:
+                index += walk.step_row
+                lead -= walk.width
+            else:
+                index += walk.step_column + walk.step_row
+                lead += walk.height - walk.width
     return count
 
 
