@@ -3,7 +3,7 @@
     python benchmarks/logs.py                                   list them
     python benchmarks/logs.py corridor_loop --size 3 --out DIR  write DIR/corridor_loop.clf, .relations and .tum
 
-Size 1 is a drive of a minute or some; time and number of scans grow in proportion. Same name, size and seed: same bytes.
+Size 1 is a drive of some minutes; the number of scans grows in proportion. Same name, size and seed: same bytes.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from posegraph_slam.datasets.simulation.motion import drive_path
 from posegraph_slam.datasets.simulation.route import plan_path
 from posegraph_slam.datasets.simulation.settings import DriveSettings, WorldSettings
 from posegraph_slam.datasets.simulation.world import build_world
+
 from simulated.driving import STEP_S, Drive, drive_route, round_and_about, with_spins
 from simulated.faults import OdometryErrors, burst_stamps, odometry, scans_with_gaps
 from simulated.floors import CorridorNet, Floor, corridor_floor, exhibition_hall
@@ -38,17 +39,14 @@ class Recipe:
 
     about: str
     place: Place
-    scanner: Scanner = Scanner()
-    errors: OdometryErrors = OdometryErrors()
+    scanner: Scanner = field(default_factory=Scanner)
+    errors: OdometryErrors = field(default_factory=OdometryErrors)
     scans_hz: float = 5.0
     people: int = 0
     bursts: bool = False
     gap_turn_rad: float = 0.0
     spins_every_s: float = 0.0
     odometry_lines: bool = True
-    full_size: float = 3.0
-    """Size of the long version."""
-    tags: tuple[str, ...] = field(default=())
 
 
 def corridors(
@@ -65,7 +63,7 @@ def corridors(
 
 
 def twins(size: float, rng: np.random.Generator) -> tuple[Floor, Drive]:
-    """Two wings with the same plan, each a comb of the same corridors 7 m apart, joined by a passage; both are driven."""
+    """Two wings of the same plan, each a comb of equal corridors 7 m apart, joined by a passage; both are driven."""
     teeth = max(2, round(2 + size))
     y = tuple(7.0 * k for k in range(teeth))
     x = (0.0, 20.0)
@@ -110,14 +108,13 @@ def offices(size: float, rng: np.random.Generator) -> tuple[Floor, Drive]:
 SICK_181 = Scanner(beams=181, no_return_m=81.91)
 RECIPES: dict[str, Recipe] = {
     "corridor_loop": Recipe(
-        about="nested loops of long corridors that look alike; 1.9 km at size 10", place=corridors, full_size=10.0
+        about="nested loops of long corridors that look alike; 1.9 km at size 10", place=corridors
     ),
     "corridor_narrow": Recipe(
         about="the same with 2 m corridors, niches every 2.5 m, odometry that drifts to the other side, 181 beams",
         place=partial(corridors, width_m=2.0, niche_every_m=2.5),
         scanner=SICK_181,
         errors=OdometryErrors(scale=-0.05, turn_rad_per_m=-0.0052),
-        full_size=5.0,
     ),
     "hall": Recipe(
         about="hall of 60 by 40 m with booths, glass fronts and 20 people; ranges to 50 m",

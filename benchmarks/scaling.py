@@ -2,8 +2,8 @@
 
     python benchmarks/scaling.py [--log office_361] [--size 2] [--out benchmarks/results/scaling.json]
 
-World and drive grow together. Each length runs in a process of its own, with compiled kernels; writes the JSON file and
-docs/images/scaling.png, and tells the exponents b of time ~ scans^b and of memory above that of the shortest log.
+World and drive grow together. Each length runs in a process of its own, with compiled kernels. Writes the JSON file and
+docs/images/scaling.png, and tells the exponents b of time ~ scans^b and of memory beyond the imported libraries.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ RESULTS = ROOT / "benchmarks" / "results" / "scaling.json"
 FIGURE = ROOT / "docs" / "images" / "scaling.png"
 FACTORS = (1, 2, 4, 8)
 KEPT = (
-    "scans", "ape_m", "proposed", "accepted", "false", "wall_s", "cpu_s", "stages_s", "peak_mib", "floor_mib", "log_mib",
+    "scans", "ape_m", "proposed", "accepted", "false", "wall_s", "cpu_s", "stages_s",
+    "peak_mib", "floor_mib", "log_mib",
 )  # fmt: skip
 
 

@@ -3,8 +3,8 @@
     python benchmarks/slam2d.py [--logs intel fr079 20] [--scans 3000] [--out benchmarks/results/slam2d.json]
 
 Each log is one run of the command in a process of its own; times and memory are those of the whole process, from
-parsing to the last file written. Kernels are compiled before, by a run over the first scans of each log. The table goes to the JSON
-file and, for complete logs, between the markers in docs/benchmarks.md.
+parsing to the last picture. Kernels are compiled before, by a run over the first scans of each log. The table goes
+to the JSON file and, for complete logs, between the markers in docs/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from references import REFERENCES, Reference
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -77,10 +78,10 @@ def with_spins(drive: Drive, times_s: FloatArray, *, yaw_rate_rad_s: float = 1.2
     around = np.append(np.arange(0.0, 2 * np.pi, yaw_rate_rad_s * STEP_S), 2 * np.pi)
     pieces, start, turns = [], 0, 0.0
     for stop in np.sort(np.round(times_s / STEP_S).astype(np.int64)).tolist():
-        pieces.append(drive.xyt[start:stop] + [0, 0, turns])
+        pieces.append(drive.xyt[start:stop] + np.array([0.0, 0.0, turns]))
         pieces.append(drive.xyt[stop] + np.stack([0 * around, 0 * around, turns + around], axis=1))
         start, turns = stop, turns + 2 * np.pi
-    pieces.append(drive.xyt[start:] + [0, 0, turns])
+    pieces.append(drive.xyt[start:] + np.array([0.0, 0.0, turns]))
     return Drive(xyt=np.concatenate(pieces))
 
 
@@ -100,8 +101,8 @@ def round_and_about(
     def length(a: tuple[int, int], b: tuple[int, int]) -> float:
         return abs(x[a[0]] - x[b[0]]) + abs(y[a[1]] - y[b[1]])
 
-    travelled = sum(length(a, b) for a, b in zip(nodes[:-1], nodes[1:], strict=True))
-    for a, b in zip(nodes[:-1], nodes[1:], strict=True):
+    travelled = sum(length(a, b) for a, b in pairwise(nodes))
+    for a, b in pairwise(nodes):
         used[frozenset((a, b))] = 1.0
     while travelled < length_m:
         i, j = nodes[-1]

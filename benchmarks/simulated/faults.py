@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray
-from simulated.driving import STEP_S, Drive
+
+from simulated.driving import Drive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +78,7 @@ def _stalled(reported: FloatArray, times_s: FloatArray, errors: OdometryErrors) 
 
 
 def burst_stamps(times_s: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return stamps (N,) that come in bursts of two to six, 1 ms apart, one in twenty of them before its predecessor."""
+    """Return stamps (N,) in bursts of two to six, 1 ms apart; one in twenty comes before its predecessor."""
     stamps, k = times_s.copy(), 0
     while k < len(stamps):
         size = int(rng.integers(2, 7))
@@ -102,6 +103,3 @@ def scans_with_gaps(times_s: FloatArray, drive: Drive, gap_turn_rad: float, ever
                 k += int(after[0])
         k += 1
     return times_s[kept]
-
-
-__all__ = ["STEP_S", "OdometryErrors", "burst_stamps", "odometry", "scans_with_gaps"]

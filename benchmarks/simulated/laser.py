@@ -9,6 +9,7 @@ import numpy as np
 from posegraph_slam.arrays import Float32Array, FloatArray, IntArray
 from posegraph_slam.datasets.simulation.raycast import cast_fan
 from posegraph_slam.jit import kernel
+
 from simulated.driving import Drive
 from simulated.floors import Floor
 
@@ -126,7 +127,8 @@ def _measure(exact: FloatArray, scanner: Scanner, rng: np.random.Generator) -> F
     other = np.clip(beam + rng.choice(np.array([-1, 1]), size=exact.shape), 0, len(beam) - 1)
     beside = np.take_along_axis(exact, other, axis=1)
     both = np.isfinite(exact) & np.isfinite(beside)
-    edge = both & (np.abs(np.where(both, exact, 0.0) - np.where(both, beside, 0.0)) > 0.3) & (rng.random(exact.shape) < scanner.mixed)
+    step = np.abs(np.where(both, exact, 0.0) - np.where(both, beside, 0.0))
+    edge = (step > 0.3) & (rng.random(exact.shape) < scanner.mixed)
     blend = rng.random(exact.shape)
     values[edge] = (blend * exact + (1 - blend) * beside)[edge]
     values += scanner.sigma_m * rng.standard_normal(exact.shape)

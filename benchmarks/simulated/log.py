@@ -13,6 +13,7 @@ from posegraph_slam.arrays import Float32Array, FloatArray
 from posegraph_slam.datasets.tum import write_tum
 from posegraph_slam.geometry import SE2, Relations, Trajectory, pose_from_xyt, spatial_from_planar, wrap_angle
 from posegraph_slam.sensors import LaserScans, RobotLog
+
 from simulated.laser import Scanner, mounted
 
 NEAR_S, FAR_S = 9.0, 30.0
