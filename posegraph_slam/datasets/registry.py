@@ -64,6 +64,11 @@ BUILT_IN = (
         "a text file .clf, .log or .txt, or one of them compressed as .gz",
     ),
     _built_in(
+        "humanoid",
+        "walking humanoid with a LiDAR on its panning and nodding head (UPenn ESE650, UCSD ECE276A)",
+        "a file train_lidar0.mat beside train_joint0.mat, or a folder that holds the two",
+    ),
+    _built_in(
         "imu_vicon",
         "hand-held IMU board, raw ADC counts, with motion-capture truth where it is known (ESE650, ECE276A)",
         "an .npz file with imu_raw and imu_stamps_s and, when present, vicon_rotation and vicon_stamps_s",

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from posegraph_slam.datasets.simulation.humanoid import write_humanoid_log
+
 EPOCH_S = 1298445274.5
 
 
@@ -111,6 +113,7 @@ def build(name: str, folder: Path) -> Path:
         "ece276a": lambda: write_ece276a(folder / "run"),
         "carmen": lambda: write_carmen(folder / "log.clf"),
         "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
+        "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
     }[name]()
 
 
@@ -121,6 +124,7 @@ def build_truncated(name: str, folder: Path) -> tuple[Path, Path]:
         "ece276a": lambda: write_ece276a(folder / "run"),
         "carmen": lambda: write_carmen(folder / "log.clf.gz"),
         "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
+        "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
     }[name]()
     file = path / "Hokuyo7.npz" if path.is_dir() else path
     file.write_bytes(file.read_bytes()[:-100])
