@@ -23,25 +23,37 @@ def optimize(
     log_format: Format = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")] = None,
     workers: Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")] = None,
+    no_loops: Annotated[bool, typer.Option("--no-loops", help="Close no loops: scan matching alone.")] = False,
+    stages: Annotated[
+        str | None,
+        typer.Option("--stages", help="Only these, comma-separated: odometry, matching, graph, maps."),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option("--from", metavar="STAGE", help="LOG is a run directory: start over from `matching` or `graph`."),
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
     """Turn a log into an optimised trajectory and maps, in a run directory of its own."""
-    from posegraph_slam.pipeline.configuration import load_configuration
+    from posegraph_slam.pipeline.rerun import plan_run
     from posegraph_slam.pipeline.run import run
     from posegraph_slam.report.run_figures import draw_figures
 
-    configuration = load_configuration(config or [], settings or [], seed=seed, workers=workers)
+    plan = plan_run(
+        log, config or [], settings or [], seed=seed, workers=workers, no_loops=no_loops, stages=stages, start=start
+    )
     with ProgressBars(enabled=not quiet) as progress:
         summary = run(
-            log,
-            configuration,
-            out=out or default_out(log),
+            plan.log,
+            plan.configuration,
+            out=out or default_out(plan.log if start is None else log.with_name(f"{log.resolve().name}-{start}")),
             overwrite=overwrite,
-            log_format=log_format,
+            log_format=log_format or plan.log_format,
             truth=truth,
+            matching_of=plan.matching_of,
             draw=draw_figures,
             progress=progress,
         )

@@ -42,19 +42,18 @@ class LinearGraph:
     def relative_covariance(self, i: IntArray, j: IntArray) -> FloatArray:
         """Covariance (M, 3, 3) of the motion from node i (M,) to node j (M,), in the tangent of its right update."""
         group, poses = self.graph.group, self.graph.poses
-        back = -group.adjoint(group.between(poses[j], poses[i]))
+        by_i = -group.adjoint(group.between(poses[j], poses[i]))
         size = 3 * len(self.graph) + RATES
         result = np.zeros((len(i), 3, 3))
         for start in range(0, len(i), AT_ONCE):
             rows = np.arange(start, min(start + AT_ONCE, len(i)))
-            columns = np.zeros((size, 3 * len(rows)))
-            at = np.arange(3)[None, :]
-            block = 3 * (rows - start)[:, None] + at
-            columns[(3 * i[rows, None] + at)[:, :, None], block[:, None, :]] = np.swapaxes(back[rows], 1, 2)
-            columns[(3 * j[rows, None] + at)[:, :, None], block[:, None, :]] = np.eye(3)
-            solved = self.factor.solve(columns).reshape(size, len(rows), 3)
-            gathered = columns.reshape(size, len(rows), 3)
-            result[rows] = np.einsum("nmp,nmq->mpq", gathered, solved)
+            pair = np.arange(len(rows))[:, None]
+            at_i, at_j = 3 * i[rows, None] + np.arange(3), 3 * j[rows, None] + np.arange(3)
+            columns = np.zeros((size, len(rows), 3))
+            columns[at_i, pair] = np.swapaxes(by_i[rows], 1, 2)
+            columns[at_j, pair] = np.eye(3)
+            solved = self.factor.solve(columns.reshape(size, -1)).reshape(size, len(rows), 3)
+            result[rows] = by_i[rows] @ solved[at_i, pair] + solved[at_j, pair]
         return 0.5 * (result + np.swapaxes(result, 1, 2))
 
 

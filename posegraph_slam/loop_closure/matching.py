@@ -158,7 +158,7 @@ def register_many(  # type: ignore[no-untyped-def]
             back = between(relative, np.zeros(3))
             a, c, h = visibility(refs[r], source, back, margin, points, kind, thinned, geometry)
             back_agree, back_conflict = back_agree + a, back_conflict + c
-        found[m], hessians[m] = pose, hessian
+        found[m], hessians[m] = pose, hessian / len(refs)
         measures[m, 0] = score
         measures[m, 1] = stats[1] / max(stats[0], 1.0)
         measures[m, 2] = min(agree / max(agree + conflict, 1), back_agree / max(back_agree + back_conflict, 1))

@@ -14,7 +14,7 @@ from posegraph_slam.loop_closure.proposals import Candidates
 from posegraph_slam.loop_closure.settings import VerificationSettings
 from posegraph_slam.loop_closure.verification import chi2_gate, passing, rejection_reasons
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
-from posegraph_slam.pose_graph.residuals import chi2
+from posegraph_slam.pose_graph.residuals import chi2, constraint_residuals
 from posegraph_slam.pose_graph.solve import solve
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
 from posegraph_slam.registration.beam_scans import BeamScans
@@ -39,6 +39,8 @@ class RefinementSettings(Settings):
     """Keyframes further apart are not matched,"""
     turn_max_rad: float = Field(default=1.6, gt=0)
     """nor those that look further apart than this."""
+    moved_max_m: float = Field(default=0.2, gt=0)
+    """A match that moves a pair further has slipped along a wall: the graph is already right to centimetres."""
     covariance_floor_m: float = Field(default=0.01, gt=0)
     """A match is not known better than this,"""
     covariance_floor_rad: float = Field(default=0.003, gt=0)
@@ -58,7 +60,7 @@ def refine_overlaps(
     """Add the matches of overlapping keyframes to a graph that is right up to centimetres, and solve it again.
 
     `graph` (K nodes, base poses) and `scans` (K). Each round replaces the matches of the round before; those that
-    fail verification or the gate of `verification.sigma_max` are left out.
+    fail verification, move the pair too far, or lie beyond `verification.sigma_max` of the solution are left out.
     """
     executor = executor or SerialExecutor()
     kept = graph.constraints
@@ -69,12 +71,18 @@ def refine_overlaps(
         candidates = overlapping_pairs(graph, settings)
         evidence = register_candidates(candidates, scans, graph.poses @ scans.T_base_lidar, single, executor)
         found = constraints_of(candidates, evidence, scans, settings.covariance_floor_m, settings.covariance_floor_rad)
-        agrees = chi2(graph.with_constraints(found)) <= 4 * gate  # twice the sigmas: the graph still moves
-        agrees &= passing(rejection_reasons(candidates, evidence, single))
-        graph = graph.with_constraints(Constraints.concatenate([kept, found.select(agrees)]))
-        graph = graph.with_poses(solve(graph, solver).poses)
+        moved = constraint_residuals(graph.with_constraints(found))
+        near = np.hypot(moved[:, 0], moved[:, 1]) <= settings.moved_max_m
+        found = found.select(near & passing(rejection_reasons(candidates, evidence, single)))
+        graph = _solved(graph, kept, found, solver)
+        graph = _solved(graph, kept, found.select(chi2(graph.with_constraints(found)) <= gate), solver)
     progress("refinement", settings.rounds, settings.rounds)
     return graph
+
+
+def _solved(graph: PoseGraph, kept: Constraints, found: Constraints, solver: SolverSettings) -> PoseGraph:
+    graph = graph.with_constraints(Constraints.concatenate([kept, found]))
+    return graph.with_poses(solve(graph, solver).poses)
 
 
 def overlapping_pairs(graph: PoseGraph, settings: RefinementSettings) -> Candidates:

@@ -22,7 +22,7 @@ class ProposalSettings(Settings):
     """Keyframes are gathered into places of about this length of travel; one keyframe of each is tried."""
     view_distance_m: float = Field(default=3.0, gt=0)
     """Places further apart than this, beyond what drift explains, do not see the same surfaces."""
-    travel_min_m: float = Field(default=10.0, gt=0)
+    travel_min_m: float = Field(default=15.0, gt=0)
     """Least travel between two places, counted through closures that are already accepted."""
     travel_first_m: float = Field(default=40.0, gt=0)
     """Longest travel of the first round; each round doubles it, so that short loops are closed first."""
@@ -36,7 +36,7 @@ class ProposalSettings(Settings):
     """The search window never reaches further than this,"""
     drift_max_rad: float = Field(default=0.8, gt=0)
     """nor turns further than this."""
-    targets_max: int = Field(default=3, ge=1)
+    targets_max: int = Field(default=2, ge=1)
     """Places that are tried for one place in a round."""
     rounds_max: int = Field(default=12, ge=1)
     """Rounds of proposing, verifying and solving."""

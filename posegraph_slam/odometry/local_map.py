@@ -58,7 +58,7 @@ def track(increments, sigmas, scheme, search, matching, points, lines, kind, thi
             )
             if score > 0.0 and stat2[2] > 1.2 * stat[2]:
                 pose, hessian, stat = again, hessian2, stat2
-        poses[i], hessians[i], stats[i, :6] = pose, hessian, stat
+        poses[i], hessians[i], stats[i, :6] = pose, hessian / used, stat
         moved = between(keyposes[known - 1], pose)
         if np.hypot(moved[0], moved[1]) >= scheme[1] or abs(moved[2]) >= scheme[2]:
             keyframes[known], keyposes[known] = i, pose

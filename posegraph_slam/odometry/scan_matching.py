@@ -45,6 +45,10 @@ class ScanMatchingSettings(Settings):
     """Added to the odometry's own sigma of a step, because its errors are systematic rather than random."""
     prediction_sigma_rad: float = Field(default=0.01, gt=0)
     """The same for its heading."""
+    scan_sigma_m: float = Field(default=0.005, gt=0)
+    """Jitter of a matched scan in its local map, which odometry smooths in the end,"""
+    scan_sigma_rad: float = Field(default=0.002, gt=0)
+    """and of its heading."""
     covariance_floor_m: float = Field(default=0.01, gt=0)
     """The motion between keyframes is not known better than this, whatever the number of points says."""
     covariance_floor_rad: float = Field(default=0.003, gt=0)
@@ -58,16 +62,18 @@ class ScanMatchingSettings(Settings):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScanMatchingResult:
-    """T_odom_base at every scan (N, 3, 3), the scans that are keyframes (K,), and the noise between those.
+    """T_odom_base at every scan (N, 3, 3), the scans that are keyframes (K,), and the noise of both.
 
-    `keyframe_information` (K-1, 3, 3) belongs to the motion from keyframe k to k+1, in the tangent of its right
-    update in the base frame. `matched_fraction` (N,) is the share of a scan's points that found a surface; `searched`
-    (N,) marks scans for which a window was searched.
+    `keyframe_information` (K-1, 3, 3) belongs to the motion from keyframe k to k+1, `scan_information` (N, 3, 3) to
+    the pose of each scan in the local map; both in the tangent of the right update in the base frame.
+    `matched_fraction` (N,) is the share of a scan's points that found a surface; `searched` holds the scans for which
+    a window was searched.
     """
 
     trajectory: Trajectory
     keyframes: IntArray
     keyframe_information: FloatArray
+    scan_information: FloatArray
     matched_fraction: FloatArray
     searched: IntArray
     remarks: tuple[str, ...] = ()
@@ -75,6 +81,7 @@ class ScanMatchingResult:
     def __post_init__(self) -> None:
         object.__setattr__(self, "keyframes", read_only(self.keyframes, np.int64))
         object.__setattr__(self, "keyframe_information", read_only(self.keyframe_information))
+        object.__setattr__(self, "scan_information", read_only(self.scan_information))
         object.__setattr__(self, "matched_fraction", read_only(self.matched_fraction))
         object.__setattr__(self, "searched", read_only(self.searched, np.int64))
 
@@ -107,6 +114,12 @@ def select_keyframes(poses: FloatArray, settings: ScanMatchingSettings) -> IntAr
         np.cumsum(np.abs(step[:, 2])) / settings.keyframe_turn_rad,
     )
     return np.flatnonzero(np.concatenate([[True], np.diff(np.floor(progress), prepend=0.0) > 0]))
+
+
+def _scan_noise(count: int, settings: ScanMatchingSettings) -> FloatArray:
+    """Information (N, 3, 3) of scans that no local map holds in place."""
+    sigmas = np.array([settings.scan_sigma_m, settings.scan_sigma_m, settings.scan_sigma_rad])
+    return np.tile(np.diag(sigmas**-2.0), (count, 1, 1))
 
 
 def _track_local_map(
@@ -159,6 +172,9 @@ def _track_local_map(
         trajectory=odometry.trajectory.with_poses(base),
         keyframes=keyframes,
         keyframe_information=matched + inverse(covariance),
+        scan_information=information_in_base(
+            information_with_floor(hessians, settings.scan_sigma_m, settings.scan_sigma_rad), scans.T_base_lidar
+        ),
         matched_fraction=fraction,
         searched=searched,
         remarks=remarks,
@@ -181,6 +197,7 @@ def _chain_scans(
         trajectory=odometry.trajectory.with_poses(poses),
         keyframes=keyframes,
         keyframe_information=inverse(covariance),
+        scan_information=_scan_noise(len(poses), settings),
         matched_fraction=np.concatenate([[1.0], pairs.inlier_fraction]),
         searched=np.zeros(0, dtype=np.int64),
         remarks=(remark,) if len(failed) else (),
@@ -195,6 +212,7 @@ def _odometry_alone(odometry: OdometryEstimate, settings: ScanMatchingSettings) 
         trajectory=odometry.trajectory,
         keyframes=keyframes,
         keyframe_information=inverse(covariance),
+        scan_information=_scan_noise(len(poses), settings),
         matched_fraction=np.zeros(len(poses)),
         searched=np.zeros(0, dtype=np.int64),
     )

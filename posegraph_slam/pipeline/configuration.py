@@ -39,7 +39,8 @@ class Configuration(Settings):
     loop_closure: LoopClosureSettings = LoopClosureSettings()
     refinement: RefinementSettings = RefinementSettings()
     smoothing: bool = True
-    """Smooth the poses of all scans between the keyframes with the odometry."""
+    """Smooth the poses of all scans with odometry from wheels, which is known at the scans' own stamps; poses that a
+    logger wrote beside the scans lag by an unknown part of a scan and would only bend the path."""
     pose_graph: SolverSettings = SolverSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
     maps: bool = True
     """Rebuild the maps from the trajectories."""

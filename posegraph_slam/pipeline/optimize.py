@@ -16,15 +16,17 @@ from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_
 from posegraph_slam.geometry import SE2, Trajectory, deform
 from posegraph_slam.loop_closure.closing import LoopClosureResult, close_loops
 from posegraph_slam.loop_closure.ledger import LoopRecord
+from posegraph_slam.loop_closure.refinement import refine_overlaps
 from posegraph_slam.mapping.crispness import crispness
 from posegraph_slam.mapping.occupancy import OccupancyGrid, build_occupancy
 from posegraph_slam.mapping.texture import TextureMap, build_texture
 from posegraph_slam.odometry.scan_matching import ScanMatchingResult, match_scans
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
+from posegraph_slam.odometry.smoothing import smooth
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
-from posegraph_slam.registration.beam_scans import prepare_beam_scans
+from posegraph_slam.registration.beam_scans import BeamScans, prepare_beam_scans
 from posegraph_slam.sensors import LaserScans, RobotLog
 
 STAGES = ("odometry", "scan matching", "optimised")
@@ -35,15 +37,16 @@ STAGES = ("odometry", "scan matching", "optimised")
 class OptimizationResult:
     """Everything that a run found.
 
-    `stages` maps odometry, scan matching and optimised to their trajectories of all scans (body frame); `keyframes`
-    (K,) are the scans that are nodes of `graph`; `loops` records every candidate that was tried.
+    `stages` maps odometry, scan matching and optimised to their trajectories of all scans (body frame); `matched`
+    says which scans are nodes of `graph`; `loops` records every candidate that was tried; maps are None where they
+    were not asked for.
     """
 
     stages: Mapping[str, Trajectory]
-    keyframes: IntArray
+    matched: ScanMatchingResult
     graph: PoseGraph
     loops: tuple[LoopRecord, ...]
-    occupancy: OccupancyGrid
+    occupancy: OccupancyGrid | None
     texture: TextureMap | None
     comparison: ComparisonTable
     metrics: Mapping[str, Any]
@@ -57,6 +60,11 @@ class OptimizationResult:
         return self.stages["optimised"]
 
     @property
+    def keyframes(self) -> IntArray:
+        """Scans (K,) that are nodes of the graph."""
+        return self.matched.keyframes
+
+    @property
     def rejected_pairs(self) -> IntArray:
         """Target and source keyframe (R, 2) of the candidates that were rejected."""
         pairs = [(record.target, record.source) for record in self.loops if not record.accepted]
@@ -67,13 +75,15 @@ def optimize(
     log: RobotLog,
     configuration: Configuration,
     *,
+    matched: ScanMatchingResult | None = None,
     progress: Progress = silent_progress,
     executor: Executor | None = None,
 ) -> OptimizationResult:
     """Run all stages on a log in memory: odometry, scan matching, loop closure, maps and their comparison.
 
-    The result depends on the log and the configuration alone, not on the number of workers. Raises InputError for a
-    log without usable scans.
+    `matched` is the scan matching of an earlier run of the same log, taken instead of a new one. The result depends
+    on the log and the configuration alone, not on the number of workers. Raises InputError for a log without usable
+    scans.
     """
     executor, clock = executor or SerialExecutor(), StageClock()
     scans = usable_scans(log)
@@ -81,37 +91,35 @@ def optimize(
         odometry = odometry_at_scans(log, configuration.odometry)
     with clock.stage("scan matching"):
         beams = prepare_beam_scans(scans, configuration.scans, executor)
-        matched = match_scans(beams, odometry, configuration.scan_matching, executor=executor, progress=progress)
+        if matched is None:
+            matched = match_scans(beams, odometry, configuration.scan_matching, executor=executor, progress=progress)
     with clock.stage("loop closure"):
-        closed = close_loops(
-            keyframe_chain(matched),
-            beams.select(matched.keyframes),
-            configuration.loop_closure,
-            configuration.pose_graph,
-            executor=executor,
-            progress=progress,
-        )
-        optimised = deform(matched.trajectory, matched.keyframes, closed.graph.poses)
+        closed = _close(matched, beams, configuration, executor, progress)
+    with clock.stage("refinement"):
+        graph = _refine(closed.graph, matched, beams, configuration, executor, progress)
+        optimised = deform(matched.trajectory, matched.keyframes, graph.poses)
+        if configuration.smoothing and odometry.source in ("wheels", "wheels_imu"):
+            optimised = smooth(optimised, matched.scan_information, odometry)
     stages = dict(zip(STAGES, (odometry.trajectory, matched.trajectory, in_map_frame(optimised)), strict=True))
     with clock.stage("maps"):
-        maps = {
-            name: build_occupancy(scans, trajectory, configuration.mapping, progress=progress)
-            for name, trajectory in stages.items()
-        }
-        texture = _texture(log, stages["optimised"], maps["optimised"], configuration, executor, progress)
+        maps = _maps(scans, stages, configuration, progress)
+        texture = _texture(log, stages["optimised"], maps.get("optimised"), configuration, executor, progress)
     with clock.stage("evaluation"):
         measured = {
             name: evaluate_trajectory(
-                trajectory, truth=log.truth, relations=log.relations, crispness=crispness(maps[name])
+                trajectory,
+                truth=log.truth,
+                relations=log.relations,
+                crispness=crispness(maps[name]) if name in maps else None,
             )
             for name, trajectory in stages.items()
         }
     return OptimizationResult(
         stages=stages,
-        keyframes=matched.keyframes,
-        graph=closed.graph,
+        matched=matched,
+        graph=graph,
         loops=closed.records,
-        occupancy=maps["optimised"],
+        occupancy=maps.get("optimised"),
         texture=texture,
         comparison=compare(measured),
         metrics={
@@ -122,6 +130,57 @@ def optimize(
         truth=log.truth,
         remarks=(*log.remarks, *odometry.remarks, *matched.remarks, *_warnings(closed)),
     )
+
+
+def _close(
+    matched: ScanMatchingResult,
+    beams: BeamScans,
+    configuration: Configuration,
+    executor: Executor,
+    progress: Progress,
+) -> LoopClosureResult:
+    return close_loops(
+        keyframe_chain(matched),
+        beams.select(matched.keyframes),
+        configuration.loop_closure,
+        configuration.pose_graph,
+        executor=executor,
+        progress=progress,
+    )
+
+
+def _refine(
+    graph: PoseGraph,
+    matched: ScanMatchingResult,
+    beams: BeamScans,
+    configuration: Configuration,
+    executor: Executor,
+    progress: Progress,
+) -> PoseGraph:
+    """Match overlapping keyframes again, unless loop closure is off: then the chain of scan matching stands."""
+    if not configuration.loop_closure.enabled:
+        return graph
+    return refine_overlaps(
+        graph,
+        beams.select(matched.keyframes),
+        configuration.refinement,
+        configuration.loop_closure.verification,
+        configuration.pose_graph,
+        executor=executor,
+        progress=progress,
+    )
+
+
+def _maps(
+    scans: LaserScans, stages: Mapping[str, Trajectory], configuration: Configuration, progress: Progress
+) -> dict[str, OccupancyGrid]:
+    """Build the occupancy map of each stage, so that their crispness can be compared."""
+    if not configuration.maps:
+        return {}
+    return {
+        name: build_occupancy(scans, trajectory, configuration.mapping, progress=progress)
+        for name, trajectory in stages.items()
+    }
 
 
 def usable_scans(log: RobotLog) -> LaserScans:
@@ -162,13 +221,13 @@ def in_map_frame(trajectory: Trajectory) -> Trajectory:
 def _texture(
     log: RobotLog,
     trajectory: Trajectory,
-    occupancy: OccupancyGrid,
+    occupancy: OccupancyGrid | None,
     configuration: Configuration,
     executor: Executor,
     progress: Progress,
 ) -> TextureMap | None:
-    """Colour the floor where the log has images."""
-    if log.rgbd is None or not log.rgbd.has_images:
+    """Colour the floor, on the cells of the occupancy map, where the log has images."""
+    if occupancy is None or log.rgbd is None or not log.rgbd.has_images:
         return None
     return build_texture(
         log.rgbd,

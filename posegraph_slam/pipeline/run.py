@@ -16,8 +16,15 @@ from posegraph_slam.jit import measure_compile_time
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration, usable_workers
 from posegraph_slam.pipeline.executors import open_executor
+from posegraph_slam.pipeline.matching_file import MATCHING, read_matching
 from posegraph_slam.pipeline.optimize import OptimizationResult, optimize
-from posegraph_slam.pipeline.run_directory import RECORD, RunDirectory, create_run_directory, require_free
+from posegraph_slam.pipeline.run_directory import (
+    RECORD,
+    RunDirectory,
+    create_run_directory,
+    read_run_directory,
+    require_free,
+)
 from posegraph_slam.pipeline.run_record import run_record
 from posegraph_slam.pipeline.saving import save_run
 
@@ -44,13 +51,15 @@ def run(
     overwrite: bool = False,
     log_format: str | None = None,
     truth: Path | None = None,
+    matching_of: Path | None = None,
     draw: Draw | None = None,
     progress: Progress = silent_progress,
     command: Sequence[str] | None = None,
 ) -> RunSummary:
     """Optimise the log at `log_path` and leave everything in the run directory `out`.
 
-    `truth` names a TUM file of true body poses that replaces the log's own. `out` appears when all is written; an
+    `truth` names a TUM file of true body poses that replaces the log's own; `matching_of` a run directory of the same
+    log whose scan matching is taken over. `out` appears when all is written; an
     error leaves nothing. Raises InputError where `out` is taken or the log cannot be used.
     """
     require_free(out, overwrite=overwrite)
@@ -61,7 +70,10 @@ def run(
                 log = read(log_path, format=log_format)
                 if truth is not None:
                     log = dataclasses.replace(log, truth=read_tum(truth, parent="ref", child="base"))
-            result = optimize(log, configuration, progress=progress, executor=executor)
+            matched = None
+            if matching_of is not None and log.scans is not None:
+                matched = read_matching(read_run_directory(matching_of).path(MATCHING), len(log.scans))
+            result = optimize(log, configuration, matched=matched, progress=progress, executor=executor)
         for name, seconds in result.stages_s.items():
             clock.seconds[name] = seconds
         with clock.stage("saving"):

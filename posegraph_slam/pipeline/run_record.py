@@ -75,7 +75,7 @@ def fingerprint(path: Path) -> dict[str, Any]:
         with item.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest() if item != path else file.read())
     sha256 = digest.hexdigest() if size <= HASHED_BYTES else None
-    return {"path": str(path), "files": len(files), "bytes": size, "sha256": sha256}
+    return {"path": str(path.resolve()), "files": len(files), "bytes": size, "sha256": sha256}
 
 
 def peak_memory_mib() -> float:

@@ -10,6 +10,7 @@ from posegraph_slam.mapping.archive import write_occupancy
 from posegraph_slam.mapping.images import write_png
 from posegraph_slam.mapping.nav2 import map_pixels, write_nav2
 from posegraph_slam.mapping.texture import texture_pixels
+from posegraph_slam.pipeline.matching_file import MATCHING, write_matching
 from posegraph_slam.pipeline.optimize import OptimizationResult
 from posegraph_slam.pipeline.run_directory import LOOPS, METRICS, RunDirectory
 from posegraph_slam.pose_graph.g2o import write_g2o
@@ -22,6 +23,7 @@ def save_run(result: OptimizationResult, directory: RunDirectory) -> None:
     """Write trajectories, graph, loop candidates, metrics and maps; docs/run_directory.md describes the files."""
     for stage, name in TRAJECTORY_FILES.items():
         write_tum(result.stages[stage], directory.path(name))
+    write_matching(result.matched, directory.path(MATCHING))
     write_g2o(result.graph, directory.path("graph.g2o"))
     save_loops(result, directory)
     directory.write_json(METRICS, {"table": result.comparison.as_dict(), **result.metrics})
@@ -48,6 +50,8 @@ def save_loops(result: OptimizationResult, directory: RunDirectory) -> None:
 
 def save_maps(result: OptimizationResult, directory: RunDirectory) -> None:
     """Write the occupancy map for nav2, for eyes and exactly, and the texture map where there is one."""
+    if result.occupancy is None:
+        return
     folder = directory.path("maps/map.pgm").parent
     write_nav2(result.occupancy, folder)
     write_png(map_pixels(result.occupancy), folder / "map.png")

@@ -6,6 +6,7 @@ import numpy as np
 
 from posegraph_slam.pipeline.optimize import OptimizationResult
 from posegraph_slam.pipeline.run_directory import RunDirectory
+from posegraph_slam.pose_graph.graph import ConstraintKind
 from posegraph_slam.report.figures import draw_map, draw_texture, draw_trajectories, loop_segments
 
 
@@ -15,8 +16,12 @@ def draw_figures(result: OptimizationResult, directory: RunDirectory) -> None:
     Files: figures/trajectories.png, figures/map.png, figures/map_rejected.png, figures/texture.png.
     """
     draw_trajectories(result.stages, directory.path("figures/trajectories.png"), truth=result.truth)
+    if result.occupancy is None:
+        return
     positions = result.graph.poses[:, :-1, -1]
-    loops = loop_segments(positions, result.graph.constraints)
+    constraints = result.graph.constraints
+    # matches of overlapping keyframes are everywhere: they would hide the map and the closures
+    loops = loop_segments(positions, constraints.select(constraints.kind != int(ConstraintKind.OVERLAP)))
     draw_map(result.occupancy, directory.path("figures/map.png"), trajectory=result.trajectory, loops=loops)
     if len(result.rejected_pairs):
         draw_map(

@@ -1,0 +1,41 @@
+"""The scan matching of a run, stored so that loop closure can be tried again without it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from posegraph_slam.errors import InputError
+from posegraph_slam.geometry import Trajectory
+from posegraph_slam.mapping.archive import npz_bytes, read_npz, replace_file
+from posegraph_slam.odometry.scan_matching import ScanMatchingResult
+
+MATCHING = "scan_matching.npz"
+ARRAYS = ("keyframes", "keyframe_information", "scan_information", "matched_fraction", "searched")
+
+
+def write_matching(matched: ScanMatchingResult, path: Path) -> None:
+    """Write poses, keyframes and their noise exactly."""
+    arrays = {name: getattr(matched, name) for name in ARRAYS}
+    trajectory = {"stamps_s": matched.trajectory.stamps_s, "poses": matched.trajectory.poses}
+    replace_file(path, npz_bytes({**trajectory, **arrays}))
+
+
+def read_matching(path: Path, scans: int) -> ScanMatchingResult:
+    """Read the scan matching of a log of `scans` scans; InputError where the file is of another log."""
+    arrays = read_npz(path, ("stamps_s", "poses", *ARRAYS))
+    count = len(arrays["stamps_s"])
+    if count != scans:
+        raise InputError(path, f"holds {count} scans, but the log has {scans}", "give the run directory of this log")
+    if arrays["poses"].shape != (count, 3, 3) or not np.isfinite(arrays["poses"]).all():
+        raise InputError(path, "does not hold finite planar poses", "run `psg optimize` again to write it")
+    trajectory = Trajectory(stamps_s=arrays["stamps_s"], poses=arrays["poses"], parent="odom", child="base")
+    return ScanMatchingResult(
+        trajectory=trajectory,
+        keyframes=arrays["keyframes"],
+        keyframe_information=arrays["keyframe_information"],
+        scan_information=arrays["scan_information"],
+        matched_fraction=arrays["matched_fraction"],
+        searched=arrays["searched"],
+    )
