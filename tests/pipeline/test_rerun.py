@@ -1,0 +1,78 @@
+"""Choosing stages, and taking a finished run up again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posegraph_slam.datasets.simulation import simulate, tiny_settings
+from posegraph_slam.datasets.tum import read_tum
+from posegraph_slam.errors import ConfigurationError, InputError
+from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.matching_file import MATCHING, read_matching
+from posegraph_slam.pipeline.rerun import plan_run
+from posegraph_slam.pipeline.run import run
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rerun")
+    log = simulate(tiny_settings(duration_s=30.0), folder / "log")
+    run(log, Configuration(), out=folder / "run")
+    return folder / "run"
+
+
+def test_a_rerun_from_the_graph_equals_the_run(finished: Path, tmp_path: Path) -> None:
+    plan = plan_run(finished, [], [], start="graph")
+    assert plan.matching_of == finished
+    again = run(plan.log, plan.configuration, out=tmp_path / "again", matching_of=plan.matching_of)
+    for name in ("trajectory.tum", "graph.g2o", "loops.csv", "maps/map.npz", MATCHING):
+        assert (again.folder / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def test_overrides_apply_on_top_of_the_runs_configuration(finished: Path) -> None:
+    plan = plan_run(finished, [], ["loop_closure.proposals.fixed_interval=3"], start="graph", no_loops=True)
+    assert plan.configuration.loop_closure.proposals.fixed_interval == 3
+    assert not plan.configuration.loop_closure.enabled
+    assert plan_run(finished, [], [], start="matching").matching_of is None
+
+
+def test_stages_left_out_leave_no_trace(finished: Path, tmp_path: Path) -> None:
+    log = plan_run(finished, [], [], start="matching").log
+    plan = plan_run(log, [], [], stages="odometry, matching")
+    result = run(plan.log, plan.configuration, out=tmp_path / "short")
+    assert not (result.folder / "maps").exists()
+    assert json.loads((result.folder / "metrics.json").read_text())["loops_proposed"] == 0
+    bare = plan_run(log, [], [], stages="odometry")
+    alone = run(bare.log, bare.configuration, out=tmp_path / "bare").folder
+    poses = [read_tum(alone / name, parent="map", child="base").poses for name in ("odometry.tum", "trajectory.tum")]
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-8)
+
+
+def test_wrong_stages_and_runs_are_named(finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="'loops' is not a stage"):
+        plan_run(finished, [], [], stages="loops")
+    with pytest.raises(ConfigurationError, match="'maps' is not a stage to start from"):
+        plan_run(finished, [], [], start="maps")
+    with pytest.raises(InputError, match="not a run directory"):
+        plan_run(tmp_path, [], [], start="graph")
+    moved = tmp_path / "moved"
+    shutil.copytree(finished, moved)
+    record = json.loads((moved / "run.json").read_text())
+    record["input"]["path"] = str(tmp_path / "gone")
+    (moved / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match="is gone"):
+        plan_run(moved, [], [], start="graph")
+
+
+def test_matching_of_another_log_is_refused(finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="but the log has 7"):
+        read_matching(finished / MATCHING, 7)
+    broken = tmp_path / MATCHING
+    broken.write_bytes((finished / MATCHING).read_bytes()[:200])
+    with pytest.raises(InputError, match="truncated"):
+        read_matching(broken, 7)
