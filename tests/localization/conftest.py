@@ -61,11 +61,15 @@ def drawn_map(resolution: float = 0.05, yaw: float = 0.0) -> OccupancyGrid:
 
 def walk(count: int) -> np.ndarray:
     """Poses (N, 3) of a walk from room to room, 0.1 m or so a step."""
-    corners = np.array([[1, 1.2], [2.5, 4.3], [5.2, 4.3], [8, 4.6], [8, 7.5], [5.5, 7.5], [5.2, 4.3], [8.3, 1.2], [12.5, 1.5],
-                        [13, 5], [10.5, 5]])  # fmt: skip
+    corners = np.array([
+        [1, 1.2], [2.5, 4.3], [5.2, 4.3], [8, 4.6], [8, 7.5], [5.5, 7.5], [5.2, 4.3], [5.2, 1.2], [8.3, 1.2], [12.5, 1.5],
+        [13, 5], [10.5, 5],
+    ])  # fmt: skip
     leg = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     s = np.linspace(0.3, leg[-1] - 0.3, count)
-    smooth = [np.mean([np.interp(s + d, leg, corners[:, k]) for d in np.linspace(-0.3, 0.3, 9)], axis=0) for k in (0, 1)]
+    smooth = [
+        np.mean([np.interp(s + d, leg, corners[:, k]) for d in np.linspace(-0.3, 0.3, 9)], axis=0) for k in (0, 1)
+    ]
     heading = np.unwrap(np.arctan2(np.gradient(smooth[1]), np.gradient(smooth[0])))
     return np.stack([*smooth, heading], axis=1)
 
@@ -122,3 +126,12 @@ def kidnapped() -> World:
         grid=drawn_map(), scans=scans, truth=truth,
         odometry=Trajectory(stamps_s=scans.stamps_s, poses=poses, parent="odom", child="base"),
     )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def dense() -> World:
+    """One scan whose beams lie less than a cell apart."""
+    rng = np.random.default_rng(7)
+    truth = walk(240)[30:32]
+    scans = make_scans(truth, rng, beams=1081)
+    return World(grid=drawn_map(), scans=scans, truth=truth, odometry=make_odometry(truth, rng, scans.stamps_s))

@@ -63,7 +63,9 @@ def test_combs_vary_less_than_independent_draws() -> None:
     rng = np.random.default_rng(2)
     weights = np.array([0.1, 0.2, 0.3, 0.4])
     spread = {
-        scheme: np.var([np.bincount(resample(weights, 15, scheme, rng), minlength=4) for _ in range(2000)], axis=0).sum()
+        scheme: np.var(
+            [np.bincount(resample(weights, 15, scheme, rng), minlength=4) for _ in range(2000)], axis=0
+        ).sum()
         for scheme in SCHEMES
     }
     assert spread["systematic"] < 0.3 * spread["multinomial"]
