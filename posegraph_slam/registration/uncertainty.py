@@ -36,7 +36,9 @@ def describe_pairs(
     count, p = len(s), 3 * (d - 1)
     centre, radius = centre_and_radius(source, s, count, d)
     jacobian, offset, length, weight = np.zeros((count, p)), np.zeros(count), np.zeros(count), np.zeros(count)
-    gaps, gap, arm, n, metric = np.zeros((count, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    gaps, gap, arm, n, axis = np.zeros((count, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    whole = count if residual == GENERALISED else 0
+    rows, metrics, pulls = np.zeros((whole, 3, p)), np.zeros((whole, 3, 3)), np.zeros((whole, p))
     for k in range(count):
         square = 0.0
         for a in range(d):
@@ -58,15 +60,21 @@ def describe_pairs(
         elif residual == PLANE:
             length[k], weight[k] = abs(offset[k]), trust[t[k]]
         else:
+            for c in range(d):  # the shift along axis c of the target
+                for a in range(d):
+                    axis[a] = T[c, a]
+                tangent_row(d, arm, axis, rows[k, c])
             for a in range(3):
-                arm[a] = T[a, 0] * source_normals[s[k], 0] + T[a, 1] * source_normals[s[k], 1]
-                arm[a] += T[a, 2] * source_normals[s[k], 2]
-            flat_metric(d, normals[t[k]], arm, plane_share, metric)
+                axis[a] = T[a, 0] * source_normals[s[k], 0] + T[a, 1] * source_normals[s[k], 1]
+                axis[a] += T[a, 2] * source_normals[s[k], 2]
+            flat_metric(d, normals[t[k]], axis, plane_share, metrics[k])
             square, flatness = 0.0, 0.0
             for a in range(d):
                 for b in range(d):
-                    square += gap[a] * metric[a, b] * gap[b]
-                    flatness += normals[t[k], a] * metric[a, b] * normals[t[k], b]
+                    square += gap[a] * metrics[k, a, b] * gap[b]
+                    flatness += normals[t[k], a] * metrics[k, a, b] * normals[t[k], b]
+                    for c in range(p):
+                        pulls[k, c] += rows[k, a, c] * metrics[k, a, b] * gap[b]
             length[k], weight[k] = np.sqrt(square), flatness
     known, total, squares = 0.0, 0.0, 0.0
     for k in range(count):
@@ -83,14 +91,23 @@ def describe_pairs(
         bent, total = 0.0, 0.0
         for k in range(count):
             bent += weight[k] * robust_slope(loss, length[k] / scale)
-            weight[k] *= robust_weight(loss, length[k] / scale)
+            robust = robust_weight(loss, length[k] / scale)
+            weight[k] *= robust
+            if whole > 0:
+                metrics[k] *= robust
+                pulls[k] *= robust
             total += weight[k]
         slope = max(bent / (total + 1e-300), 0.1)
     H = np.zeros((p, p))
     for k in range(count):
         for a in range(p):
             for b in range(p):
-                H[a, b] += weight[k] * jacobian[k, a] * jacobian[k, b]
+                if whole == 0:
+                    H[a, b] += weight[k] * jacobian[k, a] * jacobian[k, b]
+                    continue
+                for c in range(d):
+                    for e in range(d):
+                        H[a, b] += rows[k, c, a] * metrics[k, c, e] * rows[k, e, b]
     values, vectors = np.linalg.eigh(H)
     free = 0
     while free < p and values[free] <= max(ratio * values[p - 1], 2.2250738585072014e-308):
@@ -101,8 +118,12 @@ def describe_pairs(
         for j in range(held):
             for a in range(p):
                 scores[k, j] += weight[k] * jacobian[k, a] * vectors[a, free + j]
-    middle_part = score_products(d, scores, offset, length, gaps, thickness, anchors, target, normals, neighbours, t,
-                                 residual, slope, sigma_floor)  # fmt: skip
+    if whole > 0:
+        middle_part = raw_score_products(scores, pulls @ np.ascontiguousarray(vectors[:, free:]), t, neighbours,
+                                         sigma_floor)  # fmt: skip
+    else:
+        middle_part = score_products(d, scores, offset, length, gaps, thickness, anchors, target, normals, neighbours,
+                                     t, residual, slope, sigma_floor)  # fmt: skip
     freedom = count / max(count - held, 1)
     covariance = np.zeros((held, held))
     for i in range(held):
@@ -145,40 +166,92 @@ def score_products(
     k_all = neighbours.shape[1]
     leaning = np.zeros((len(target), held))
     M = np.zeros((held, held))
-    if residual == GENERALISED:
-        for k in range(count):
-            sigma = offset[k] if abs(offset[k]) > sigma_floor else (sigma_floor if offset[k] >= 0 else -sigma_floor)
+    inverse, gap = np.zeros((3, 3)), np.zeros(3)
+    reach = residual == PLANE
+    for k in range(count):
+        sigma = max(length[k], sigma_floor)
+        for a in range(held):
+            for b in range(held):
+                M[a, b] += scores[k, a] * scores[k, b] * sigma * sigma * k_all / (k_all + 1)
+        sigma = slope * max(thickness[t[k]], sigma_floor)
+        if reach:
+            tangent_inverse(d, target, anchors[t[k]], normals[t[k]], neighbours[t[k]], inverse)
+            for a in range(d):
+                gap[a] = 0.0
+                for b in range(d):
+                    gap[a] += inverse[a, b] * gaps[k, b]
+        for j in neighbours[t[k]]:
+            share, lever = 0.0, 1.0
+            for a in range(d):
+                share += normals[t[k], a] * normals[j, a]
+                if reach:
+                    lever += gap[a] * (target[j, a] - anchors[t[k], a])
+            share *= sigma * lever / k_all
             for a in range(held):
-                leaning[t[k], a] += scores[k, a] * sigma
-    else:
-        inverse, gap = np.zeros((3, 3)), np.zeros(3)
-        for k in range(count):
-            sigma = max(length[k], sigma_floor)
+                leaning[j, a] += share * scores[k, a]
+    shared = np.zeros((len(target), held))
+    for k in range(count):
+        for j in neighbours[t[k]]:
             for a in range(held):
-                for b in range(held):
-                    M[a, b] += scores[k, a] * scores[k, b] * sigma * sigma * k_all / (k_all + 1)
-            sigma = slope * max(thickness[t[k]], sigma_floor)
-            reach = residual == PLANE
-            if reach:
-                tangent_inverse(d, target, anchors[t[k]], normals[t[k]], neighbours[t[k]], inverse)
-                for a in range(d):
-                    gap[a] = 0.0
-                    for b in range(d):
-                        gap[a] += inverse[a, b] * gaps[k, b]
-            for j in neighbours[t[k]]:
-                share, lever = 0.0, 1.0
-                for a in range(d):
-                    share += normals[t[k], a] * normals[j, a]
-                    if reach:
-                        lever += gap[a] * (target[j, a] - anchors[t[k], a])
-                share *= sigma * lever / k_all
-                for a in range(held):
-                    leaning[j, a] += share * scores[k, a]
+                shared[j, a] += scores[k, a] * offset[k]
+    near = np.zeros((held, held))
     for row in range(len(target)):
         for a in range(held):
             for b in range(held):
                 M[a, b] += leaning[row, a] * leaning[row, b]
-    return M
+                near[a, b] += shared[row, a] * shared[row, b] / k_all
+    return larger_of(M, near)
+
+
+@kernel
+def raw_score_products(
+    scores: FloatArray, pulls: FloatArray, t: IntArray, neighbours: IntArray, sigma_floor: float
+) -> FloatArray:
+    """Sum M (h, h) for pairs of raw points: their pulls (m, h) hold the noise of both points already.
+
+    Those that share a target are summed first. `scores` (m, h), the pull of a unit of distance, set the floor.
+    """
+    count, held = pulls.shape
+    targets, k_all = neighbours.shape
+    leaning, shared = np.zeros((targets, held)), np.zeros((targets, held))
+    M, near = np.zeros((held, held)), np.zeros((held, held))
+    for k in range(count):
+        for a in range(held):
+            leaning[t[k], a] += pulls[k, a]
+            for b in range(held):
+                M[a, b] += scores[k, a] * scores[k, b] * sigma_floor**2
+        for j in neighbours[t[k]]:
+            for a in range(held):
+                shared[j, a] += pulls[k, a]
+    for row in range(targets):
+        for a in range(held):
+            for b in range(held):
+                M[a, b] += leaning[row, a] * leaning[row, b]
+                near[a, b] += shared[row, a] * shared[row, b] / k_all
+    return larger_of(M, near)
+
+
+@kernel
+def larger_of(M: FloatArray, other: FloatArray) -> FloatArray:
+    """Matrix (h, h) that is M, but as large as `other` in the directions in which that is larger."""
+    h = len(M)
+    if h == 0:
+        return M
+    values, vectors = np.linalg.eigh(M)
+    root, back = np.zeros((h, h)), np.zeros((h, h))
+    for a in range(h):
+        for b in range(h):
+            size = np.sqrt(max(values[b], 1e-300))
+            root[a, b], back[b, a] = vectors[a, b] * size, vectors[a, b] / size
+    ratio = back @ other @ back.T
+    ratios, axes = np.linalg.eigh((ratio + ratio.T) / 2)
+    turned = root @ axes
+    result = np.zeros((h, h))
+    for j in range(h):
+        for a in range(h):
+            for b in range(h):
+                result[a, b] += max(ratios[j], 1.0) * turned[a, j] * turned[b, j]
+    return result
 
 
 @kernel
@@ -223,7 +296,7 @@ def tangent_inverse(
                 for b in range(2):
                     inverse[a, b] = first[a] * first[b] / xx
         return
-    damping = 0.05 * (xx + yy)
+    damping = 0.002 * (xx + yy)
     xx += damping
     yy += damping
     det = xx * yy - xy * xy
