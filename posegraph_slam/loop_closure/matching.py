@@ -40,6 +40,8 @@ class Evidence:
     rmse_m: FloatArray
     ambiguous: BoolArray
     """Whether another pose of the window fits nearly as well."""
+    blind: BoolArray
+    """Whether the pose lies far from a guess at which the two scans would see nothing of each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +67,7 @@ def register_candidates(
     ]
     parts = executor.map(partial(_register_chunk, settings=settings), work)
     if not parts:
-        parts = [(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 6)))]
+        parts = [(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 7)))]
     pose, hessian, measures = (np.concatenate([part[k] for part in parts]) for k in range(3))
     return Evidence(
         T_target_source=pose_from_xyt(pose),
@@ -76,6 +78,7 @@ def register_candidates(
         overlap=measures[:, 3],
         rmse_m=measures[:, 4],
         ambiguous=measures[:, 5] > 0,
+        blind=measures[:, 6] > 0,
     )
 
 
@@ -114,6 +117,9 @@ def constraints_of(
     )
 
 
+BLIND_BEYOND_M, BLIND_SHARE = 1.0, 0.15
+"""A pose further than this from the guess is no evidence where at the guess less than this share could be seen: two
+scans that look away from each other fit nowhere but where, by mistake, they overlap."""
 SEARCH_BEYOND_M = 0.25
 """A guess at least this good is refined without a search."""
 
@@ -125,10 +131,10 @@ def register_many(  # type: ignore[no-untyped-def]
     """Register sources[m] to the keyframes targets[m] - around .. targets[m] + around for every m.
 
     Returns lidar poses (M, 3) in the frame of the target, Hessians (M, 3, 3), and score, matched fraction, agreement,
-    overlap, rmse and whether a rival was found (M, 6).
+    overlap, rmse, whether a rival was found, and whether the guess was blind (M, 7).
     """
     count = len(targets)
-    found, hessians, measures = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 6))
+    found, hessians, measures = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 7))
     prior = np.eye(3) * 1e-3
     for m in range(count):
         target, source = targets[m], sources[m]
@@ -147,6 +153,15 @@ def register_many(  # type: ignore[no-untyped-def]
             )
             if score == 0.0:
                 continue
+        moved = between(between(poses[target], poses[source]), pose)
+        if np.hypot(moved[0], moved[1]) > BLIND_BEYOND_M:
+            at_guess = between(poses[target], poses[source])
+            agree, conflict, total = 0, 0, 0
+            for r in range(len(refs)):
+                relative = between(ref_poses[r], at_guess)
+                a, c, h = visibility(source, refs[r], relative, margin, points, kind, thinned, geometry)
+                agree, conflict, total = agree + a, conflict + c, total + a + c + h
+            measures[m, 6] = agree + conflict < BLIND_SHARE * total
         pose, hessian, stats = match_scan(
             source, refs, ref_poses, pose, prior, matching, points, lines, kind, thinned, geometry
         )

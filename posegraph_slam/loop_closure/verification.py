@@ -27,6 +27,7 @@ def rejection_reasons(candidates: Candidates, evidence: Evidence, settings: Veri
             "too few points match: {:.2f}",
             evidence.matched_fraction,
         ),
+        (evidence.blind, "overlaps only far from the guess, where nothing could be seen", evidence.score),
         (evidence.ambiguous, "another pose in the window fits nearly as well", evidence.score),
         (evidence.rmse_m > settings.rmse_max_m, "residual too large: {:.3f} m", evidence.rmse_m),
     )

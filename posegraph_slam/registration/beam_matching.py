@@ -15,7 +15,6 @@ from posegraph_slam.jit import kernel
 from posegraph_slam.registration.beam_scans import GEOMETRY_HEAD
 from posegraph_slam.settings import Settings
 
-
 NORMAL_SIGMA_RAD = 0.07
 """Standard deviation of a fitted normal: 1-2 cm of noise over the 0.2-0.4 m that a line is fitted to."""
 
@@ -181,7 +180,8 @@ def match_scan(source, refs, ref_poses, start, prior, settings, points, lines, k
 
     `prior` (3, 3) is the information of `start` itself; `settings` a vector of gate_start, gate_end, robust_start,
     robust_end, sigma, min_cosine, iterations, rotation and translation tolerance. Returns the pose, the Hessian
-    of the matches over sigma^2 (3, 3), less what the noise of the normals pretends to know, and statistics: seen, matched, weight sum, rmse, iterations, last step.
+    of the matches over sigma^2 (3, 3) less what the noise of the normals pretends to know, and statistics: seen,
+    matched, weight sum, rmse, iterations, last step.
     """
     gate_start, gate_end, robust_start, robust_end = settings[0], settings[1], settings[2], settings[3]
     sigma2, min_cosine, iterations = settings[4] ** 2, settings[5], int(settings[6])

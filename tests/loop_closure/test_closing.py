@@ -154,7 +154,8 @@ def test_a_pair_is_tried_again_only_with_a_much_better_guess() -> None:
     assert ledger.untried(first).tolist() == [0]
     evidence = Evidence(
         T_target_source=SE2.identity(1), hessian=np.eye(3)[None], score=np.zeros(1), matched_fraction=np.zeros(1),
-        agreement=np.zeros(1), overlap=np.zeros(1), rmse_m=np.zeros(1), ambiguous=np.zeros(1, dtype=np.bool_),
+        agreement=np.zeros(1), overlap=np.zeros(1), rmse_m=np.zeros(1),
+        ambiguous=np.zeros(1, dtype=np.bool_), blind=np.zeros(1, dtype=np.bool_),
     )  # fmt: skip
     ledger.add(0, first, evidence, error_before=np.zeros((1, 3)), sigmas_before=np.zeros(1), reasons=["no"])
     assert ledger.untried(first).tolist() == []
