@@ -57,7 +57,8 @@ class CertificateStatus(StrEnum):
 class Certificate:
     """Chordal cost F of the poses (n, d+1, d+1), a lower bound of F over all poses, and what they prove.
 
-    `poses` minimise F; `smallest_eigenvalue` is that of S with translations eliminated; `rank` is 0 where no proof was tried.
+    `poses` minimise F; `smallest_eigenvalue` is that of S with translations eliminated; `rank` is 0 where nothing was
+    tried.
     """
 
     status: CertificateStatus
@@ -72,6 +73,11 @@ class Certificate:
     def gap(self) -> float:
         """The relative gap (F - bound) / F."""
         return (self.chordal_cost - self.lower_bound) / max(self.chordal_cost, COST_FLOOR)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the solution that this certificate came with is the one that the proof leads to."""
+        return self.rank > 0 and self.proven and self.status is not CertificateStatus.UNKNOWN
 
     @property
     def proven(self) -> bool:
@@ -116,10 +122,11 @@ def _certificate(problem: ChordalProblem, at: Lifted, cost: float, verdict: _Ver
         poses=pose_from_rotation_translation(at.Q[:, :d, :d], at.t[:, :d]))  # fmt: skip
     if found.proven:
         return found
-    return _with_status(found, CertificateStatus.UNKNOWN, f"a gap of {found.gap:.2g} remains")
+    return with_status(found, CertificateStatus.UNKNOWN, f"a gap of {found.gap:.2g} remains")
 
 
-def _with_status(found: Certificate, status: CertificateStatus, reason: str) -> Certificate:
+def with_status(found: Certificate, status: CertificateStatus, reason: str) -> Certificate:
+    """Return a certificate with another status and reason."""
     return Certificate(status=status, chordal_cost=found.chordal_cost, lower_bound=found.lower_bound,
                        smallest_eigenvalue=found.smallest_eigenvalue, rank=found.rank, poses=found.poses,
                        reason=reason)  # fmt: skip
@@ -139,11 +146,11 @@ def _climb(problem: ChordalProblem, pattern: BlockPattern, at: Lifted, anchors: 
     found = better if cost < first.chordal_cost * (1 - 1e-9) else _certificate(
         problem, lifted_poses(first.poses), first.chordal_cost, verdict)  # fmt: skip
     if found.proven and found is better:
-        return _with_status(found, CertificateStatus.SUBOPTIMAL, "a better basin was found")
+        return with_status(found, CertificateStatus.SUBOPTIMAL, "a better basin was found")
     if found.proven:
-        return _with_status(found, CertificateStatus.CERTIFIED, "")
-    return _with_status(found, CertificateStatus.UNKNOWN,
-                        f"the relaxation is not tight: a gap of {found.gap:.2g} remains at rank {at.Q.shape[1]}")  # fmt: skip
+        return with_status(found, CertificateStatus.CERTIFIED, "")
+    reason = f"the relaxation is not tight: a gap of {found.gap:.2g} remains at rank {at.Q.shape[1]}"
+    return with_status(found, CertificateStatus.UNKNOWN, reason)
 
 
 def _unfit(graph: PoseGraph) -> str | None:
@@ -156,7 +163,7 @@ def _unfit(graph: PoseGraph) -> str | None:
 
 
 def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) -> tuple[Lifted, float]:
-    """Minimise F from lifted poses by damped Newton steps with the exact Hessian; `anchors` (n,) stay where they are."""
+    """Minimise F from lifted poses by damped Newton steps with the exact Hessian; `anchors` (n,) do not move."""
     d, rank = problem.dimension, at.Q.shape[1]
     basis, rows = tangents(d, rank), np.flatnonzero(~anchors)
     place = np.cumsum(~anchors) - 1
@@ -204,7 +211,7 @@ def _verdict(problem: ChordalProblem, pattern: BlockPattern, at: Lifted, anchors
     rounding = 1e-15 * float(np.max(np.abs(S)))
     shifts = [max(cost, COST_FLOOR) * share / count for share in PROOF_SHIFTS]
     shifts += [shifts[-1] * 10.0**k for k in range(1, 16)]
-    for number, shift in enumerate(shifts):
+    for shift in shifts:
         shifted = np.array(S)
         shifted[:, np.arange(d), np.arange(d)] += shift
         factor = factorize(pattern, shifted, problem.off_diagonal, 0.0)
@@ -214,7 +221,7 @@ def _verdict(problem: ChordalProblem, pattern: BlockPattern, at: Lifted, anchors
         return _Verdict(lower_bound=0.0, eigenvalue=float("nan"), direction=None)
     eigenvalue, vector = _smallest(pattern, factor, shift, len(S), d)
     bound = total - count * (shift + rounding)
-    proven = number < len(PROOF_SHIFTS)
+    proven = shift <= shifts[len(PROOF_SHIFTS) - 1]
     return _Verdict(lower_bound=max(bound, 0.0), eigenvalue=eigenvalue, direction=None if proven else vector)
 
 

@@ -1,9 +1,9 @@
 """The chordal cost of SE-Sync and its derivatives at any rank, edge by edge in numba.
 
-F = sum k |R_j - R_i R_ij|^2 + t |t_j - t_i - R_i t_ij|^2 (Rosen et al. 2019) is quadratic in X_i = [R_i t_i]: with T the
-measurement and W = diag(k, ..., k, t) it is tr(X M X^T), where M has -T W at (i, j), and sums W at j and T W T^T at i.
-At rank r the R_i are r x d with orthonormal columns: the first d columns of an orthogonal Q_i. Tangents are Q_i A with A
-r x (d+1): a skew part and free rows below it for the rotation, a column for the translation.
+F = sum k |R_j - R_i R_ij|^2 + t |t_j - t_i - R_i t_ij|^2 (Rosen et al. 2019) is quadratic in X_i = [R_i t_i]: with T
+the measurement and W = diag(k, ..., k, t) it is tr(X M X^T), where M has -T W at (i, j), and sums W at j and T W T^T
+at i. At rank r the R_i are r x d with orthonormal columns: the first d columns of an orthogonal Q_i. Tangents are Q_i A
+with A r x (d+1): a skew part and free rows below it for the rotation, a column for the translation.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def moved(at: Lifted, basis: Tangents, delta: FloatArray, dimension: int) -> Lif
     n, r = at.t.shape
     A = np.zeros((n, r, max(r, dimension + 1)))
     for k in range(2):
-        np.add.at(A, (slice(None), basis.row[:, k], basis.column[:, k]), basis.sign[:, k] * delta)
+        A[:, basis.row[:, k], basis.column[:, k]] += basis.sign[:, k] * delta  # no place repeats within one k
     Z = np.zeros((n, r, r))
     Z[:, :, :dimension] = A[:, :, :dimension]
     Z[:, :dimension, dimension:] = -np.swapaxes(Z[:, dimension:, :dimension], 1, 2)

@@ -30,7 +30,7 @@ class Component(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edited:
-    """A graph after a change, which edges (E,) of the old one it kept, and what was done in one line ("" for nothing)."""
+    """A graph after a change, which edges (E,) of the old one it kept, and a line on what was done ("": nothing)."""
 
     graph: PoseGraph
     kept: BoolArray

@@ -79,6 +79,11 @@ def write_g2o(graph: PoseGraph, path: Path | str) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
+def pose_of_numbers(where: str, numbers: FloatArray) -> FloatArray:
+    """Return the pose (d+1, d+1) of x y theta (3,) or x y z qx qy qz qw (7,)."""
+    return np.asarray(_poses(Path(where), numbers[None], np.zeros(1, dtype=np.int64))[0])
+
+
 def _poses(path: Path, reals: FloatArray, lines: IntArray) -> FloatArray:
     """Turn x y theta (n, 3) or x y z qx qy qz qw (n, 7) into matrices."""
     if reals.shape[1] == 3:
