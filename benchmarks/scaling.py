@@ -61,7 +61,8 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
         top = [b + row["stages_s"][stage] for b, row in zip(below, rows, strict=True)]
         left.fill_between(scans, below, top, label=stage, alpha=0.75, linewidth=0)
         below = top
-    left.plot(scans, [rows[0]["wall_s"] * n / scans[0] for n in scans], "k--", linewidth=1, label="proportional")
+    left.plot(scans, [row["cpu_s"] for row in rows], "k.-", linewidth=1, label="CPU time")
+    left.plot(scans, [rows[0]["cpu_s"] * n / scans[0] for n in scans], "k--", linewidth=1, label="proportional")
     left.set(xlabel="scans", ylabel="time [s]", xlim=(scans[0], scans[-1]), ylim=(0, None))
     left.legend(fontsize=8)
     used = [row["peak_mib"] - row["floor_mib"] for row in rows]
@@ -98,6 +99,7 @@ def main() -> None:
             flush=True,
         )
     growth = {
+        "CPU time": round(exponent(rows, [row["cpu_s"] for row in rows]), 3),
         "time": round(exponent(rows, [row["wall_s"] for row in rows]), 3),
         "memory": round(exponent(rows, [row["peak_mib"] - row["floor_mib"] for row in rows]), 3),
         **{
