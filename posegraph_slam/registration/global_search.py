@@ -58,6 +58,9 @@ class GlobalSearchSettings(Settings):
     """A refining step that turns less, and moves less than the same share of the radius, ends the refinement."""
 
 
+ROUGHLY = 3.0
+"""Times the limit of the RMSE that the table of nearest points, coarse as it is, may show of a pose that will fit."""
+
 DEFAULT_SEARCH = GlobalSearchSettings()
 
 
@@ -115,10 +118,12 @@ def register_globally(
     T_source_frame = source_frame(cloud.points, settings)
     points = transform_points(inverse_pose(T_source_frame), cloud.points)
     starts = make_starts(points, prepared.cloud.points.mean(axis=0), settings)
-    poses, origin = thin_out(starts, points, prepared.field, settings)
+    poses, origin, roughly = thin_out(starts, points, prepared.field, settings)
+    radius = float(np.sqrt(np.sum(points**2, axis=1).mean()))
+    if roughly > ROUGHLY * settings.rmse_limit_share * radius:
+        return _nothing(RegistrationStatus.TOO_FEW_INLIERS, len(starts))
     T, start, rmse = choose(points, poses, origin, prepared.cloud, settings)
     result = refine(cloud, prepared.cloud, T @ inverse_pose(T_source_frame), rmse, settings)
-    radius = float(np.sqrt(np.sum(points**2, axis=1).mean()))
     final = trimmed_rmse(cloud.points, prepared.cloud, result.T_target_source, settings.keep_fraction)
     if not result.usable or final > settings.rmse_limit_share * radius:
         return _nothing(result.status if not result.usable else RegistrationStatus.TOO_FEW_INLIERS, len(starts))
@@ -150,8 +155,8 @@ def make_starts(points: FloatArray, target_mean: FloatArray, settings: GlobalSea
 
 def thin_out(
     starts: FloatArray, points: FloatArray, field: NearestField, settings: GlobalSearchSettings
-) -> tuple[FloatArray, IntArray]:
-    """Return the poses that survive all rounds, best first, and the rows of `starts` that they came from."""
+) -> tuple[FloatArray, IntArray, float]:
+    """Return the poses that survive all rounds, best first, the rows of `starts` they came from, and the best RMSE."""
     coarse, fine = evenly(points, settings.coarse_points), evenly(points, settings.fine_points)
     table = (field.row, field.points, field.normals, field.origin, field.voxel_m)
     poses, origin = starts, np.arange(len(starts))
@@ -163,7 +168,7 @@ def thin_out(
         poses, origin = poses[best], origin[best]
     poses, scores = descend_all(poses, fine, *table, settings.keep_fraction, 30, True)
     best = np.argsort(scores, kind="stable")
-    return poses[best], origin[best]
+    return poses[best], origin[best], float(np.sqrt(scores[best[0]]))
 
 
 def choose(
