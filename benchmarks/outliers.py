@@ -2,9 +2,9 @@
 
     python benchmarks/outliers.py [--seeds 5] [--shares 0.1 0.5 1] [--graphs intel manhattan] [--workers 1]
 
-Adds false loops of three kinds to the g2o files of PSG_DATA, starts from odometry, and compares with the optimum without
-them: position RMSE, and precision and recall of the loops kept. Writes benchmarks/results/outliers.json and the table
-between the markers of docs/benchmarks.md.
+Adds false loops of three kinds to the g2o files of PSG_DATA, starts from odometry, and compares with the optimum
+without them: position RMSE, and precision and recall of the loops kept. Writes benchmarks/results/outliers.json and the
+table between the markers of docs/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -78,12 +78,13 @@ def passed(row: dict[str, Any]) -> bool:
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """One line a graph, kind and share: the worst of the seeds for ours, the medians of the others."""
-    lines = ["| graph | false loops | share | RMSE, median [m] | worst [m] | precision, least | recall, least | passed | time [s] "
-             "| plain LM [m] | Huber [m] |", "|---|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    header = ["graph", "false loops", "share", "RMSE, median [m]", "worst [m]", "precision, least", "recall, least",
+              "passed", "time [s]", "plain LM [m]", "Huber [m]"]  # fmt: skip
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     for key in dict.fromkeys((r["graph"], r["kind"], r["share"]) for r in rows):
         cases = [r for r in rows if (r["graph"], r["kind"], r["share"]) == key]
         errors = [r["rmse_m"] for r in cases]
-        peers = [f"{np.median([r[p] for r in cases if p in r]):.1f}" for p in ("none_m", "huber_m")]
+        peers = [median([r[p] for r in cases if p in r]) for p in ("none_m", "huber_m")]
         lines.append(
             f"| {key[0]} | {key[1]} | {100 * key[2]:.0f} % | {np.median(errors):.3f} | {max(errors):.3f} "
             f"| {min(r['precision'] for r in cases):.4f} | {min(r['recall'] for r in cases):.3f} "
@@ -94,6 +95,10 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     lines.append(f"\n{total} of {len(rows)} runs ({100 * total / len(rows):.0f} %) meet the limits "
                  "(0.05 m on intel, 0.5 m on manhattan; precision 0.99, recall 0.9).")  # fmt: skip
     return "\n".join(lines)
+
+
+def median(values: Sequence[float]) -> str:
+    return f"{np.median(values):.1f}" if values else "-"
 
 
 def main() -> None:
@@ -117,8 +122,7 @@ def main() -> None:
             rows.append(row)
             print(json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}), flush=True)
     print(table(rows))
-    default = vars(arguments) | {"workers": 1} == vars(parser.parse_args([]))
-    if default:
+    if vars(arguments) | {"workers": 1} == vars(parser.parse_args([])):
         RESULTS.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
         text = PAGE.read_text(encoding="utf-8")
         head, tail = text.split(BEGIN)[0], text.split(END)[1]
