@@ -14,6 +14,8 @@ from posegraph_slam.pose_graph.graph import Constraints
 
 SMALL_ANGLE_RAD = 1e-4
 """Below this the planar coefficients come from their Taylor series."""
+PLANAR, SPATIAL = 3, 6
+"""Sizes of the tangent, known when the kernels are compiled, so that their inner loops are unrolled."""
 SMALL_SQUARE = 1e-2
 """Squared angle below which the spatial coefficients come from their series, whose dropped terms are under 1e-16."""
 
@@ -59,36 +61,83 @@ def squared_lengths(residuals: FloatArray, information: FloatArray) -> FloatArra
     return result
 
 
-@kernel
 def normal_equations(count: int, i: IntArray, j: IntArray, residuals: FloatArray, by_i: FloatArray, by_j: FloatArray,
                      information: FloatArray,
                      weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return gradient (N, p), diagonal blocks (N, p, p) and blocks (i, j) (E, p, p) of the Gauss-Newton Hessian."""
     edges, p = residuals.shape
-    gradient, diagonal = np.zeros((count, p)), np.zeros((count, p, p))
-    off = np.zeros((edges, p, p))
-    weighted = np.empty((2, p, p))
-    pull = np.empty(p)
-    for e in range(edges):
-        weight, A, B, first, second = weights[e], by_i[e], by_j[e], i[e], j[e]
-        weighted[:] = 0.0
-        for a in range(p):
-            pull[a] = 0.0
-            for b in range(p):
-                w = weight * information[e, a, b]
-                pull[a] += w * residuals[e, b]
-                for k in range(p):
-                    weighted[0, a, k] += w * A[b, k]
-                    weighted[1, a, k] += w * B[b, k]
-        for a in range(p):
-            for k in range(p):
-                gradient[first, k] += A[a, k] * pull[a]
-                gradient[second, k] += B[a, k] * pull[a]
-                for m in range(p):
-                    diagonal[first, k, m] += A[a, k] * weighted[0, a, m]
-                    diagonal[second, k, m] += B[a, k] * weighted[1, a, m]
-                    off[e, k, m] += A[a, k] * weighted[1, a, m]
+    gradient, diagonal, off = np.zeros((count, p)), np.zeros((count, p, p)), np.empty((edges, p, p))
+    run = _planar_equations if p == PLANAR else _spatial_equations
+    run(i, j, residuals, by_i, by_j, information, weights, gradient, diagonal, off)
     return gradient, diagonal, off
+
+
+@kernel
+def _planar_equations(i: IntArray, j: IntArray, residuals: FloatArray, by_i: FloatArray, by_j: FloatArray,
+           information: FloatArray, weights: FloatArray, gradient: FloatArray, diagonal: FloatArray,
+           off: FloatArray) -> None:  # fmt: skip
+    at_i, at_j = np.empty((PLANAR, PLANAR)), np.empty((PLANAR, PLANAR))
+    pull = np.empty(PLANAR)
+    for e in range(len(i)):
+        weight, A, B, W, first, second = weights[e], by_i[e], by_j[e], information[e], i[e], j[e]
+        for a in range(PLANAR):
+            total = 0.0
+            for k in range(PLANAR):
+                at_i[a, k], at_j[a, k] = 0.0, 0.0
+            for b in range(PLANAR):
+                w = weight * W[a, b]
+                total += w * residuals[e, b]
+                for k in range(PLANAR):
+                    at_i[a, k] += w * A[b, k]
+                    at_j[a, k] += w * B[b, k]
+            pull[a] = total
+        H_i, H_j, H = diagonal[first], diagonal[second], off[e]
+        for k in range(PLANAR):
+            for m in range(PLANAR):
+                H[k, m] = 0.0
+        for a in range(PLANAR):
+            for k in range(PLANAR):
+                x, y = A[a, k], B[a, k]
+                gradient[first, k] += x * pull[a]
+                gradient[second, k] += y * pull[a]
+                for m in range(PLANAR):
+                    H_i[k, m] += x * at_i[a, m]
+                    H_j[k, m] += y * at_j[a, m]
+                    H[k, m] += x * at_j[a, m]
+
+
+@kernel
+def _spatial_equations(i: IntArray, j: IntArray, residuals: FloatArray, by_i: FloatArray, by_j: FloatArray,
+           information: FloatArray, weights: FloatArray, gradient: FloatArray, diagonal: FloatArray,
+           off: FloatArray) -> None:  # fmt: skip
+    at_i, at_j = np.empty((SPATIAL, SPATIAL)), np.empty((SPATIAL, SPATIAL))
+    pull = np.empty(SPATIAL)
+    for e in range(len(i)):
+        weight, A, B, W, first, second = weights[e], by_i[e], by_j[e], information[e], i[e], j[e]
+        for a in range(SPATIAL):
+            total = 0.0
+            for k in range(SPATIAL):
+                at_i[a, k], at_j[a, k] = 0.0, 0.0
+            for b in range(SPATIAL):
+                w = weight * W[a, b]
+                total += w * residuals[e, b]
+                for k in range(SPATIAL):
+                    at_i[a, k] += w * A[b, k]
+                    at_j[a, k] += w * B[b, k]
+            pull[a] = total
+        H_i, H_j, H = diagonal[first], diagonal[second], off[e]
+        for k in range(SPATIAL):
+            for m in range(SPATIAL):
+                H[k, m] = 0.0
+        for a in range(SPATIAL):
+            for k in range(SPATIAL):
+                x, y = A[a, k], B[a, k]
+                gradient[first, k] += x * pull[a]
+                gradient[second, k] += y * pull[a]
+                for m in range(SPATIAL):
+                    H_i[k, m] += x * at_i[a, m]
+                    H_j[k, m] += y * at_j[a, m]
+                    H[k, m] += x * at_j[a, m]
 
 
 @kernel
