@@ -86,6 +86,6 @@ def _judged(state: HealthState, evidence: Evidence, settings: HealthSettings) ->
     if state.health is Health.OK:
         return Health.OK if certain else Health.AMBIGUOUS
     # Where a map is incomplete, something nearly fits in many places: a new place has to explain the whole scan.
-    if state.explained < settings.found_above:
+    if state.agreement < settings.found_above or state.explained < settings.explained_min:
         return state.health
     return Health.OK if certain and state.updates >= settings.updates_min else Health.AMBIGUOUS

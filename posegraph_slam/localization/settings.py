@@ -101,7 +101,7 @@ class GlobalSearchSettings(Settings):
     """Candidates nearer than this,"""
     separation_rad: float = Field(default=0.35, gt=0)
     """and turned by less than this, are one."""
-    scans: int = Field(default=12, ge=1)
+    scans: int = Field(default=24, ge=1)
     """Scans that are searched together, placed by odometry."""
     every: int = Field(default=5, ge=1)
     """Updates between two searches while the pose is not known."""
@@ -116,8 +116,10 @@ class HealthSettings(Settings):
     """A return this near to an obstacle agrees with the map; one in known free space, or behind a wall, conflicts."""
     lost_below: float = Field(default=0.45, gt=0, lt=1)
     """Share of the telling returns that agree, below which the pose is lost."""
-    found_above: float = Field(default=0.65, gt=0, lt=1)
-    """Share of all returns that must agree before a new place is believed."""
+    found_above: float = Field(default=0.82, gt=0, lt=1)
+    """A new place is believed when this share of the telling returns agrees,"""
+    explained_min: float = Field(default=0.5, ge=0, lt=1)
+    """and this share of all returns, those in unknown space included."""
     memory_updates: float = Field(default=10.0, ge=1)
     """Updates over which the agreement is averaged."""
     evidence_min: int = Field(default=10, ge=1)

@@ -50,6 +50,7 @@ class SlamMap:
 def empty_map(geometry: GridGeometry, settings: ParticleSlamSettings) -> SlamMap:
     """Return a map in which nothing has been seen."""
     unit = settings.free_log_odds / UNITS_A_STEP
+    corner = int(np.ceil(np.sqrt(2) * (settings.window_cells // 2)))
     steps = np.rint([
         settings.free_log_odds * settings.occupied_per_free / unit, UNITS_A_STEP, settings.clamp_log_odds / unit,
         settings.occupied_above / unit,
@@ -60,7 +61,7 @@ def empty_map(geometry: GridGeometry, settings: ParticleSlamSettings) -> SlamMap
         near=np.full(geometry.shape, FAR, dtype=np.uint8),
         stamps=np.zeros(geometry.shape, dtype=np.uint8),
         mark=0,
-        reach=min(int(np.ceil(3 * settings.sigma_m / settings.resolution_m)), 15),
+        reach=min(max(int(np.ceil(3 * settings.sigma_m / settings.resolution_m)), corner), 15),
         steps=steps,
         unit=unit,
     )

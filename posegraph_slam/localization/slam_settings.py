@@ -47,7 +47,7 @@ class ParticleSlamSettings(Settings):
     """likelihood of a return from unknown space,"""
     beam_weight: float = Field(default=0.3, gt=0, le=1)
     """and the part of a beam's log-likelihood that counts."""
-    window_cells: int = Field(default=9, ge=1, le=31)
+    window_cells: int = Field(default=9, ge=1, le=21)
     """Window correlation: side of the window of shifts, the best of which counts."""
     correlation_power: float = Field(default=20.0, gt=0)
     """Window correlation and cell counts: the weight is the score to this power; 1 is nearly flat over near poses."""

@@ -21,7 +21,7 @@ def log_weights(
         scores = field_scores(particles, points, M, slam_map.evidence, slam_map.near, table)
         return np.asarray(settings.beam_weight * scores)
     if settings.weighting == "window_correlation":
-        scores = window_scores(particles, points, M, slam_map.evidence, slam_map.steps[3], settings.window_cells // 2)
+        scores = window_scores(particles, points, M, slam_map.near, settings.window_cells // 2)
     else:
         scores = count_scores(particles, points, sensor, M, slam_map.evidence, slam_map.steps[3])
     return np.asarray(settings.correlation_power * np.log1p(np.maximum(scores, 0)))
@@ -61,9 +61,9 @@ def field_scores(particles, points, M, evidence, near, table):  # type: ignore[n
 
 
 @kernel
-def window_scores(particles, points, M, evidence, above, half):  # type: ignore[no-untyped-def]
+def window_scores(particles, points, M, near, half):  # type: ignore[no-untyped-def]
     """Largest, over shifts of up to `half` cells either way, of the obstacles under the returns (N,)."""
-    rows, columns = evidence.shape
+    rows, columns = near.shape
     width = 2 * half + 1
     scores = np.zeros(len(particles))
     sums = np.zeros((width, width), np.int64)
@@ -75,9 +75,11 @@ def window_scores(particles, points, M, evidence, above, half):  # type: ignore[
             y = s * points[b, 0] + c * points[b, 1] + particles[k, 1]
             column = int(np.floor(M[0, 0] * x + M[0, 1] * y + M[0, 2]))
             row = int(np.floor(M[1, 0] * x + M[1, 1] * y + M[1, 2]))
+            if not (0 <= row < rows and 0 <= column < columns) or near[row, column] > 2 * half * half:
+                continue  # no obstacle within the window
             for dy in range(max(-half, -row), min(half + 1, rows - row)):
                 for dx in range(max(-half, -column), min(half + 1, columns - column)):
-                    if evidence[row + dy, column + dx] > above:
+                    if near[row + dy, column + dx] == 0:
                         sums[dy + half, dx + half] += 1
         scores[k] = sums.max()
     return scores

@@ -62,8 +62,8 @@ def drawn_map(resolution: float = 0.05, yaw: float = 0.0) -> OccupancyGrid:
 def walk(count: int) -> np.ndarray:
     """Poses (N, 3) of a walk from room to room, 0.1 m or so a step."""
     corners = np.array([
-        [1, 1.2], [2.5, 4.3], [5.2, 4.3], [8, 4.6], [8, 7.5], [5.5, 7.5], [5.2, 4.3], [5.2, 1.2], [8.3, 1.2], [12.5, 1.5],
-        [13, 5], [10.5, 5],
+        [1, 1.2], [2.5, 4.3], [5.2, 4.3], [8, 4.6], [8, 7.5], [5.5, 7.5], [5.2, 4.3], [5.2, 1.2], [8.3, 1.2],
+        [12.5, 1.5], [13, 5], [10.5, 5],
     ])  # fmt: skip
     leg = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     s = np.linspace(0.3, leg[-1] - 0.3, count)

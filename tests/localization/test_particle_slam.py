@@ -111,7 +111,7 @@ def test_field_scores_match_a_slow_sum(world: Any, drawn: SlamMap) -> None:
 
 def test_window_scores_match_a_slow_search(world: Any, drawn: SlamMap) -> None:
     particles, points = world.truth[[20, 60, 200]] + [0.1, -0.05, 0.0], base_points(world, 60)[::4]
-    scores = window_scores(particles, points, drawn.geometry.cells_from_map, drawn.evidence, drawn.steps[3], 4)
+    scores = window_scores(particles, points, drawn.geometry.cells_from_map, drawn.near, 4)
     obstacles = np.pad(drawn.evidence > drawn.steps[3], 200)
     for particle, score in zip(particles, scores, strict=True):
         T = pose_from_xyt(particle)
