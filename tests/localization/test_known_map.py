@@ -201,7 +201,9 @@ def test_health_follows_the_evidence() -> None:
     assert judged(known, 50, agree=2, conflict=8).health is Health.OK  # off the map: nothing can be told
     assert judged(known, 1, sigma_m=2.0).health is Health.AMBIGUOUS
     assert judged(known, 1, share=0.6).health is Health.AMBIGUOUS
-    assert judged(fresh, 50, agree=30, conflict=5).health is not Health.OK  # half of the scan is unexplained
+    assert judged(fresh, 50, agree=25, conflict=3).health is not Health.OK  # most of the scan is unexplained
+    assert judged(fresh, 50, agree=45, conflict=15).health is not Health.OK  # enough to keep a track, not to begin one
+    assert judged(known, 50, agree=45, conflict=15).health is Health.OK
 
 
 def test_unusable_inputs_are_refused(world: Any) -> None:

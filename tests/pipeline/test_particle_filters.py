@@ -1,0 +1,137 @@
+"""The two commands of the particle filters, from files to run directories."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from posegraph_slam.cli.application import app
+from posegraph_slam.datasets import read
+from posegraph_slam.datasets.simulation.humanoid import write_humanoid_log
+from posegraph_slam.datasets.tum import read_tum
+from posegraph_slam.mapping.nav2 import write_nav2
+from posegraph_slam.mapping.occupancy import build_occupancy
+from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.localize import localize_log
+
+SAME_BYTES = ("trajectory.tum", "localization.csv", "metrics.json")
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A walk, and a map drawn from its true poses."""
+    folder = tmp_path_factory.mktemp("walk")
+    path = write_humanoid_log(folder, rng=np.random.default_rng(0), scans=160, beams=361)
+    log = read(path)
+    assert log.scans is not None
+    assert log.truth is not None
+    write_nav2(build_occupancy(log.scans, log.truth), folder)
+    return path
+
+
+def invoke(*arguments: str) -> str:
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def tracked(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "tracked"
+    x, y, yaw = start_of(walk)
+    invoke("localize", str(walk.with_name("map.yaml")), str(walk), "--out", str(out), "--start", f"{x},{y},{yaw}")
+    return out
+
+
+def start_of(walk: Path) -> tuple[float, float, float]:
+    truth = read_tum(walk.with_name("truth.tum"), parent="ref", child="base").poses
+    return float(truth[0, 0, 3]), float(truth[0, 1, 3]), float(np.arctan2(truth[0, 1, 0], truth[0, 0, 0]))
+
+
+def test_localize_writes_poses_covariance_and_health(walk: Path, tracked: Path) -> None:
+    truth = read_tum(walk.with_name("truth.tum"), parent="ref", child="base")
+    found = read_tum(tracked / "trajectory.tum", parent="map", child="base")
+    np.testing.assert_allclose(found.stamps_s, truth.stamps_s, atol=1e-6)
+    error = np.linalg.norm(found.positions - truth.positions, axis=1)
+    assert np.median(error) < 0.03
+    with (tracked / "localization.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(found)
+    np.testing.assert_allclose([float(row["stamp_s"]) for row in rows], found.stamps_s, atol=1e-6)
+    assert {row["health"] for row in rows} == {"ok"}
+    assert all(float(row["cov_xx"]) > 0 and float(row["cov_tt"]) > 0 for row in rows)
+    metrics = json.loads((tracked / "metrics.json").read_text())
+    assert metrics["health"] == {"lost": 0, "ambiguous": 0, "ok": len(rows)}
+    record = json.loads((tracked / "run.json").read_text())
+    assert record["map"]["path"].endswith("map.yaml")
+    assert record["input"]["format"] == "humanoid"
+
+
+def test_workers_and_repetition_change_no_byte(walk: Path, tracked: Path, tmp_path: Path) -> None:
+    x, y, yaw = start_of(walk)
+    out = tmp_path / "again"
+    invoke("localize", str(walk.with_name("map.yaml")), str(walk), "--out", str(out), "--start", f"{x},{y},{yaw}",
+           "--set", "workers=2")  # fmt: skip
+    for name in SAME_BYTES:
+        assert (out / name).read_bytes() == (tracked / name).read_bytes(), name
+
+
+def test_localize_finds_the_start_by_itself(walk: Path, tmp_path: Path) -> None:
+    out = invoke("localize", str(walk.with_name("map.yaml")), str(walk), "--out", str(tmp_path / "run"), "--json")
+    metrics = json.loads(out)["metrics"]
+    assert metrics["known_at_the_end"]
+    truth = read_tum(walk.with_name("truth.tum"), parent="ref", child="base")
+    found = read_tum(tmp_path / "run" / "trajectory.tum", parent="map", child="base")
+    assert np.linalg.norm(found.positions[-1] - truth.positions[-1]) < 0.05
+
+
+def test_pf_slam_maps_and_compares(walk: Path, tmp_path: Path) -> None:
+    runs = [tmp_path / "one", tmp_path / "two"]
+    for run, workers in zip(runs, (1, 2), strict=True):
+        invoke("pf-slam", str(walk), "--out", str(run), "--set", f"workers={workers}", "--seed", "3")
+    metrics = json.loads((runs[0] / "metrics.json").read_text())
+    rows = {row["metric"]: row["values"] for row in metrics["table"]["rows"]}
+    assert rows["APE position RMSE"]["particle filter"] < 0.05
+    for name in ("trajectory.tum", "maps/map.pgm", "maps/map.npz", "metrics.json"):
+        assert (runs[0] / name).read_bytes() == (runs[1] / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("start", ["1,2", "1,2,x", "1,2,nan"])
+def test_a_bad_start_is_one_line(walk: Path, tmp_path: Path, start: str) -> None:
+    result = CliRunner().invoke(
+        app, ["localize", str(walk.with_name("map.yaml")), str(walk), "--out", str(tmp_path / "run"), "--start", start]
+    )
+    assert result.exit_code == 2
+    assert "is not a pose" in result.output
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.data
+def test_localises_a_cut_of_intel_in_the_map_of_an_earlier_pass(psg_data: Path) -> None:
+    """The robot drives its corridor twice within 2400 scans: a map of the first pass, the second localised in it."""
+    from dataclasses import replace
+
+    from posegraph_slam.pipeline.optimize import optimize
+
+    log = read(psg_data / "carmen" / "intel.clf")
+    assert log.scans is not None
+    assert log.scan_odometry is not None
+    cut = np.arange(2400)
+    log = replace(log, scans=log.scans.select(cut), scan_odometry=log.scan_odometry.select(cut), relations=None)
+    optimised = optimize(log, Configuration()).trajectory
+    first, second = cut[:1600], cut[1600:]
+    assert log.scans is not None
+    assert log.scan_odometry is not None
+    grid = build_occupancy(log.scans.select(first), optimised.select(first))
+    later = replace(log, scans=log.scans.select(second), scan_odometry=log.scan_odometry.select(second))
+    result, _ = localize_log(grid, later, Configuration())  # without a start
+    error = np.linalg.norm(result.trajectory.positions - optimised.positions[second], axis=1)
+    known = result.health == 2
+    assert known.mean() > 0.9
+    assert np.median(error[known]) < 0.05
+    assert np.percentile(error[known], 99) < 0.2
