@@ -41,6 +41,9 @@ COST_FLOOR = 1e-9
 """Gap, as a cost, that counts as none in graphs that fit perfectly."""
 NEWTON_ITERATIONS = 200
 EXTRA_RANKS = 3
+LEVEL = 1e-13
+"""Share of the cost below which a decrease drowns in rounding."""
+LEAST_COST = 1e-20
 
 
 class CertificateStatus(StrEnum):
@@ -170,7 +173,7 @@ def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) ->
     inner = ~(anchors[problem.i] | anchors[problem.j])
     pattern = block_pattern(len(rows), place[problem.i[inner]], place[problem.j[inner]], len(basis.row))
     cost, G = value(problem, at)
-    damping = 0.0
+    damping, before = 0.0, np.inf
     for _ in range(NEWTON_ITERATIONS):
         gradient = tangent_gradient(at.Q, G, basis.row, basis.column, basis.sign)
         S = certificate_diagonal(problem, multipliers(at, G))
@@ -186,17 +189,17 @@ def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) ->
                 predicted = -float(np.sum(delta * gradient))
                 trial = moved(at, basis, delta, d)
                 new_cost, new_G = value(problem, trial)
-                if new_cost <= cost or predicted <= 1e-14 * cost:
+                if new_cost <= cost or predicted <= LEVEL * cost:
                     break
             damping = max(10 * damping, least)
             if damping > 1e20 * least:
                 return at, cost
-        if new_cost > cost:
-            return at, cost
-        fell, at, cost, G = cost - new_cost, trial, new_cost, new_G
+        at, cost, G = trial, new_cost, new_G
         damping = damping / 10 if damping > least else 0.0
-        if predicted <= 1e-15 * cost or (fell <= 1e-15 * cost and predicted <= 1e-12 * cost) or cost < 1e-20:
+        # The multipliers need the gradient to its last digits, well after the cost stopped falling.
+        if cost < LEAST_COST or (predicted <= LEVEL * cost and predicted >= 0.1 * before):
             break
+        before = predicted
     return at, cost
 
 
