@@ -9,58 +9,21 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.execution import Progress, silent_progress
-from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt, wrap_angle, xyt_from_pose
-from posegraph_slam.localization.beam_model import add_log_likelihoods, agreement, refine
-from posegraph_slam.localization.global_search import SearchStack, build_search_stack, find_places
+from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt, xyt_from_pose
+from posegraph_slam.localization.beam_model import add_log_likelihoods, agreement
+from posegraph_slam.localization.estimation import estimate
+from posegraph_slam.localization.filter_state import Estimate, FilterState, PreparedMap, prepare_map
 from posegraph_slam.localization.health import Evidence, Health, HealthState, assess
-from posegraph_slam.localization.map_field import MapField, build_map_field
-from posegraph_slam.localization.motion import propagate, step_sigmas
-from posegraph_slam.localization.particles import Particles, around, hypothesis_weights, joined, merged, moments
+from posegraph_slam.localization.motion import propagate
+from posegraph_slam.localization.particles import Particles, around, joined, merged
+from posegraph_slam.localization.recovery import moved_on, recover
 from posegraph_slam.localization.resampling import effective_number, needed_number, occupied_bins, resample
 from posegraph_slam.localization.scan_points import ScanPoints, scan_points
 from posegraph_slam.localization.settings import LocalizationSettings
-from posegraph_slam.mapping.occupancy import OccupancyGrid
+from posegraph_slam.registration.beam_matching import between
 from posegraph_slam.registration.beam_scans import BeamScans
 
-MATCHED_MIN = 8
-"""Fewer returns on lines of the map refine nothing."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PreparedMap:
-    """A map with what the filter looks up in it."""
-
-    field: MapField
-    stack: SearchStack
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FilterState:
-    """Everything the filter carries from scan to scan; poses are in the grid frame of the map.
-
-    `anchor` is the last pose that was known, moved on by odometry since, and its covariance; it is what a lost robot
-    falls back to. `recent` are the last scans that weighed the particles, each with its odometry pose (3,).
-    """
-
-    particles: Particles
-    health: HealthState
-    odometry: FloatArray
-    updated_at: FloatArray | None
-    updates_since_search: int
-    next_hypothesis: int
-    anchor: tuple[FloatArray, FloatArray] | None
-    recent: tuple[tuple[FloatArray, ScanPoints], ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Estimate:
-    """Best pose (3,) in the grid frame and its covariance (3, 3) in the tangent [x, y, theta] at the pose."""
-
-    pose: FloatArray
-    covariance: FloatArray
-    hypothesis: int
-    share: float
-    sigma_m: float
+__all__ = ["LocalizationResult", "PreparedMap", "initial_state", "localize", "predict", "prepare_map", "update"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,12 +46,6 @@ class LocalizationResult:
             object.__setattr__(self, name, read_only(getattr(self, name)))
         for name in ("health", "particles"):
             object.__setattr__(self, name, read_only(getattr(self, name), np.int64))
-
-
-def prepare_map(grid: OccupancyGrid, settings: LocalizationSettings) -> PreparedMap:
-    """Compute what the filter looks up in a map."""
-    field = build_map_field(grid, settings.beam_model, line_radius_m=settings.line_radius_m)
-    return PreparedMap(field=field, stack=build_search_stack(field, settings.search))
 
 
 def localize(
@@ -117,10 +74,10 @@ def localize(
     for k in range(count):
         points = scan_points(scans, k, settings.beam_model.points_max)
         state = predict(state, path[k], settings, rng)
-        state, estimate = update(state, known, points, settings, rng)
-        poses[k], covariance[k] = estimate.pose, estimate.covariance
+        state, found = update(state, known, points, settings, rng)
+        poses[k], covariance[k] = found.pose, found.covariance
         health[k], agreed[k] = state.health.health, state.health.agreement
-        particles[k], share[k] = len(state.particles), estimate.share
+        particles[k], share[k] = len(state.particles), found.share
         if k % 200 == 0:
             progress("localisation", k, count)
     progress("localisation", count, count)
@@ -166,11 +123,11 @@ def predict(
     state: FilterState, odometry: FloatArray, settings: LocalizationSettings, rng: np.random.Generator
 ) -> FilterState:
     """Move the particles by the robot's motion to the odometry pose (3,)."""
-    increment = _between(state.odometry, odometry)
+    increment = between(state.odometry, odometry)
     if not increment.any():
         return state
     poses = propagate(state.particles.poses, increment, settings.noise, rng)
-    anchor = None if state.anchor is None else _moved_on(state.anchor, increment, settings)
+    anchor = None if state.anchor is None else moved_on(state.anchor, increment, settings)
     return replace(state, particles=state.particles.with_poses(poses), odometry=np.asarray(odometry), anchor=anchor)
 
 
@@ -222,89 +179,10 @@ def _reported(state: FilterState, found: Estimate) -> tuple[FilterState, Estimat
     return state, replace(found, pose=state.anchor[0], covariance=state.anchor[1])
 
 
-def estimate(state: FilterState, known: PreparedMap, scan: ScanPoints, settings: LocalizationSettings) -> Estimate:
-    """Return the refined mean of the heaviest hypothesis; where the pose is not known, with the spread of all."""
-    particles, weights = state.particles, state.particles.weights
-    numbers, shares = hypothesis_weights(particles, weights)
-    best = int(shares.argmax())
-    mean, covariance, share = moments(particles.poses, weights, particles.hypothesis == numbers[best])
-    sigma_m = float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
-    floor = np.diag([settings.covariance_floor_m**2, settings.covariance_floor_m**2, settings.covariance_floor_rad**2])
-    prior = np.linalg.inv(covariance + floor)
-    field = known.field
-    pose, information, matched = refine(
-        scan.points, scan.normals, mean, prior, settings.match.vector(), field.nearest, field.lines, field.distance_m,
-        field.geometry.resolution_m,
-    )  # fmt: skip
-    if matched < MATCHED_MIN:
-        pose, information = mean, prior
-    if state.health.health is Health.OK:
-        spread = np.linalg.inv(information)
-    else:
-        _, everything, _ = moments(particles.poses, weights, np.ones(len(particles), dtype=np.bool_))
-        turn = np.eye(3)
-        everywhere = moments(particles.poses, weights, np.ones(len(particles), dtype=np.bool_))[0]
-        c, s = np.cos(everywhere[2] - pose[2]), np.sin(everywhere[2] - pose[2])
-        turn[:2, :2] = [[c, -s], [s, c]]
-        offset = _between(pose, everywhere)
-        spread = turn @ everything @ turn.T + np.outer(offset, offset)
-    return Estimate(
-        pose=pose, covariance=spread + floor, hypothesis=int(numbers[best]), share=float(share), sigma_m=sigma_m
-    )
-
-
-def recover(
-    state: FilterState, known: PreparedMap, settings: LocalizationSettings, rng: np.random.Generator
-) -> FilterState:
-    """Search the map for the last scans together, and put a share of the particles on the places found."""
-    points = _recent_points(state, settings)
-    places, _ = find_places(known.stack, points, settings.search)
-    if state.anchor is not None:
-        places = np.concatenate([state.anchor[0][None], places])
-    state = replace(state, updates_since_search=0)
-    if len(places) == 0:
-        return state
-    field = known.field
-    log_weights = np.zeros(len(places))
-    kept = np.ascontiguousarray(points[:: -(-len(points) // settings.beam_model.points_max)])
-    add_log_likelihoods(
-        places, kept, field.log_likelihood, field.outside, field.geometry.resolution_m,
-        settings.beam_model.beam_weight, log_weights,
-    )  # fmt: skip
-    each = max(int(settings.search.share * settings.number.maximum / settings.search.peaks_max), 10)
-    step = known.stack.resolution_m
-    sigmas = np.array([step, step, settings.search.angle_step_rad * 2])
-    weights = np.exp(log_weights - log_weights.max())
-    share = settings.search.share if state.next_hypothesis > 1 else 1.0 - 1e-9
-    parts = [
-        around(place, sigmas, each, state.next_hypothesis + k, rng).with_log_weights(
-            np.full(each, np.log(share * weights[k] / weights.sum() / each + 1e-300))
-        )
-        for k, place in enumerate(places)
-    ]
-    old = state.particles.drawn(
-        resample(state.particles.weights, min(len(state.particles), settings.number.maximum), "systematic", rng)
-    )
-    old = old.with_log_weights(np.full(len(old), np.log((1 - share) / len(old))))
-    particles = merged(joined([old, *parts]), settings.search.separation_m, settings.search.separation_rad)
-    return replace(state, particles=particles, next_hypothesis=state.next_hypothesis + len(places))
-
-
-def _moved_on(
-    anchor: tuple[FloatArray, FloatArray], increment: FloatArray, settings: LocalizationSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Move a pose and its covariance on by an odometry step."""
-    sigma = step_sigmas(increment, settings.noise)
-    step = pose_from_xyt(increment)
-    back = SE2.adjoint(SE2.inverse(step))
-    pose = xyt_from_pose(pose_from_xyt(anchor[0]) @ step)
-    return pose, back @ anchor[1] @ back.T + np.diag([sigma[0] ** 2, sigma[0] ** 2, sigma[1] ** 2])
-
-
 def _due(state: FilterState, settings: LocalizationSettings) -> bool:
     if state.updated_at is None:
         return True
-    moved = _between(state.updated_at, state.odometry)
+    moved = between(state.updated_at, state.odometry)
     return bool(np.hypot(moved[0], moved[1]) >= settings.update_distance_m or abs(moved[2]) >= settings.update_turn_rad)
 
 
@@ -323,17 +201,6 @@ def _weighed(state: FilterState, known: PreparedMap, scan: ScanPoints, settings:
 
 def _remember(state: FilterState, scan: ScanPoints, settings: LocalizationSettings) -> FilterState:
     return replace(state, recent=(*state.recent, (state.odometry, scan))[-settings.search.scans :])
-
-
-def _recent_points(state: FilterState, settings: LocalizationSettings) -> FloatArray:
-    """Returns of the remembered scans in the robot's present frame, within the search range."""
-    parts = []
-    for odometry, scan in state.recent:
-        x, y, theta = _between(state.odometry, odometry)
-        c, s = np.cos(theta), np.sin(theta)
-        parts.append(scan.sparse @ np.array([[c, s], [-s, c]]) + [x, y])
-    points = np.concatenate(parts)
-    return np.asarray(points[np.hypot(points[:, 0], points[:, 1]) <= settings.search.range_max_m])
 
 
 def _resampled(
@@ -358,10 +225,3 @@ def _resampled(
             ]
         )
     return replace(state, particles=particles)
-
-
-def _between(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the motion a^-1 b (3,) of planar poses."""
-    c, s = np.cos(a[2]), np.sin(a[2])
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    return np.array([c * dx + s * dy, -s * dx + c * dy, float(wrap_angle(b[2] - a[2]))])

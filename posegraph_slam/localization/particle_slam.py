@@ -9,7 +9,7 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.execution import Progress, silent_progress
-from posegraph_slam.geometry import Trajectory, planar_from_spatial, pose_from_xyt, wrap_angle, xyt_from_pose
+from posegraph_slam.geometry import Trajectory, planar_from_spatial, pose_from_xyt, xyt_from_pose
 from posegraph_slam.localization.free_space import draw_scan_by_polygon
 from posegraph_slam.localization.motion import propagate
 from posegraph_slam.localization.resampling import effective_number, normalised, resample
@@ -18,6 +18,7 @@ from posegraph_slam.localization.slam_settings import ParticleSlamSettings
 from posegraph_slam.localization.slam_weights import log_weights
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
+from posegraph_slam.registration.beam_matching import between
 from posegraph_slam.sensors import LaserScans
 
 
@@ -60,7 +61,7 @@ def particle_slam(
     poses, effective = np.empty((len(scans), 3)), np.full(len(scans), float(settings.particles))
     since, resamplings = np.full(2, np.inf), 0
     for k in range(len(scans)):
-        increment = _between(path[max(k - 1, 0)], path[k])
+        increment = between(path[max(k - 1, 0)], path[k])
         particles = propagate(particles, increment, settings.noise, rng)
         since += np.array([np.hypot(increment[0], increment[1]), abs(increment[2])])
         if since[0] >= settings.update_distance_m or since[1] >= settings.update_turn_rad:
@@ -116,9 +117,3 @@ def _cropped(grid: OccupancyGrid) -> OccupancyGrid:
         shape=(log_odds.shape[0], log_odds.shape[1]),
     )
     return OccupancyGrid(geometry=geometry, log_odds=log_odds, observed=grid.observed[part])
-
-
-def _between(a: FloatArray, b: FloatArray) -> FloatArray:
-    c, s = np.cos(a[2]), np.sin(a[2])
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    return np.array([c * dx + s * dy, -s * dx + c * dy, float(wrap_angle(b[2] - a[2]))])

@@ -1,0 +1,77 @@
+"""Finding the pose again: places where the last scans fit, and dead reckoning until one of them is believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.geometry import SE2, pose_from_xyt, xyt_from_pose
+from posegraph_slam.localization.beam_model import add_log_likelihoods
+from posegraph_slam.localization.filter_state import FilterState, PreparedMap
+from posegraph_slam.localization.global_search import find_places
+from posegraph_slam.localization.motion import step_sigmas
+from posegraph_slam.localization.particles import around, joined, merged
+from posegraph_slam.localization.resampling import resample
+from posegraph_slam.localization.settings import LocalizationSettings
+from posegraph_slam.registration.beam_matching import between
+
+
+def recover(
+    state: FilterState, known: PreparedMap, settings: LocalizationSettings, rng: np.random.Generator
+) -> FilterState:
+    """Search the map for the last scans together, and put a share of the particles on the places found."""
+    points = recent_points(state, settings)
+    places, _ = find_places(known.stack, points, settings.search)
+    if state.anchor is not None:
+        places = np.concatenate([state.anchor[0][None], places])
+    state = replace(state, updates_since_search=0)
+    if len(places) == 0:
+        return state
+    field = known.field
+    log_weights = np.zeros(len(places))
+    kept = np.ascontiguousarray(points[:: -(-len(points) // settings.beam_model.points_max)])
+    add_log_likelihoods(
+        places, kept, field.log_likelihood, field.outside, field.geometry.resolution_m,
+        settings.beam_model.beam_weight, log_weights,
+    )  # fmt: skip
+    each = max(int(settings.search.share * settings.number.maximum / settings.search.peaks_max), 10)
+    step = known.stack.resolution_m
+    sigmas = np.array([step, step, settings.search.angle_step_rad * 2])
+    weights = np.exp(log_weights - log_weights.max())
+    share = settings.search.share if state.next_hypothesis > 1 else 1.0 - 1e-9
+    parts = [
+        around(place, sigmas, each, state.next_hypothesis + k, rng).with_log_weights(
+            np.full(each, np.log(share * weights[k] / weights.sum() / each + 1e-300))
+        )
+        for k, place in enumerate(places)
+    ]
+    old = state.particles.drawn(
+        resample(state.particles.weights, min(len(state.particles), settings.number.maximum), "systematic", rng)
+    )
+    old = old.with_log_weights(np.full(len(old), np.log((1 - share) / len(old))))
+    particles = merged(joined([old, *parts]), settings.search.separation_m, settings.search.separation_rad)
+    return replace(state, particles=particles, next_hypothesis=state.next_hypothesis + len(places))
+
+
+def recent_points(state: FilterState, settings: LocalizationSettings) -> FloatArray:
+    """Returns of the remembered scans in the robot's present frame, within the search range."""
+    parts = []
+    for odometry, scan in state.recent:
+        x, y, theta = between(state.odometry, odometry)
+        c, s = np.cos(theta), np.sin(theta)
+        parts.append(scan.sparse @ np.array([[c, s], [-s, c]]) + [x, y])
+    points = np.concatenate(parts)
+    return np.asarray(points[np.hypot(points[:, 0], points[:, 1]) <= settings.search.range_max_m])
+
+
+def moved_on(
+    anchor: tuple[FloatArray, FloatArray], increment: FloatArray, settings: LocalizationSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Move a pose and its covariance on by an odometry step."""
+    sigma = step_sigmas(increment, settings.noise)
+    step = pose_from_xyt(increment)
+    back = SE2.adjoint(SE2.inverse(step))
+    pose = xyt_from_pose(pose_from_xyt(anchor[0]) @ step)
+    return pose, back @ anchor[1] @ back.T + np.diag([sigma[0] ** 2, sigma[0] ** 2, sigma[1] ** 2])
