@@ -126,7 +126,8 @@ def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
         none = np.zeros((n, 0), dtype=np.int64)
         return Surface(anchors=points, normals=np.zeros((n, d)), oriented=np.zeros(n, dtype=np.bool_),
                        thickness_m=np.zeros(n), trust=np.zeros(n), neighbours=none)  # fmt: skip
-    index = tree.neighbours(points, min(neighbours, n))
+    index = np.empty((n, min(neighbours, n)), dtype=np.int64)
+    index[tree.rows] = tree.neighbours(tree.sorted_points, min(neighbours, n))  # leaf by leaf: the cache stays warm
     anchors, normals, oriented, thickness, trust = fit_neighbourhoods(points, index)
     return Surface(anchors=anchors, normals=normals, oriented=oriented, thickness_m=thickness, trust=trust,
                    neighbours=index)  # fmt: skip

@@ -261,40 +261,81 @@ def generalised_step(
     ratio: float, plane_share: float, loss: int, scale_given: float, floor: float,
 ) -> tuple[FloatArray, bool]:  # fmt: skip
     """One Gauss-Newton step of generalised ICP: shifts in the metric of both neighbourhoods (Segal et al. 2009)."""
-    p = 3 * (d - 1)
     centre, radius = centre_and_radius(source, s, count, d)
-    metric, shift, m = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(3)
+    metric, shift = np.zeros((count, 3, 3)), np.zeros((count, 3))
     for k in range(count):
-        for a in range(3):
-            m[a] = 0.0
-            shift[k, a] = moved[s[k], a] - target[t[k], a]
-            for b in range(3):
-                m[a] += T[a, b] * source_normals[s[k], b]
-        flat_metric(d, normals[t[k]], m, plane_share, metric[k])
-        square = 0.0
-        for a in range(d):
-            for b in range(d):
-                square += shift[k, a] * metric[k, a, b] * shift[k, b]
-        length[k], weight[k] = np.sqrt(square), 1.0
+        length[k] = metric_of_pair(d, T, target[t[k]], moved[s[k]], normals[t[k]], source_normals[s[k]], plane_share,
+                                   metric[k], shift[k])  # fmt: skip
+        weight[k] = 1.0
     weigh(loss, length, weight, count, scale_given, MEDIAN_1, floor)
-    H, g, rows, arm, n = np.zeros((p, p)), np.zeros(p), np.zeros((3, p)), np.zeros(3), np.zeros(3)
-    pulled = np.zeros((3, p))
+    H, g, arm = np.zeros((6, 6)), np.zeros(6), np.zeros(3)
     for k in range(count):
         for a in range(d):
             arm[a] = (source[s[k], a] - centre[a]) / radius
-        for c in range(d):  # the shift along axis c of the target
-            for a in range(d):
-                n[a] = T[c, a]
-            tangent_row(d, arm, n, rows[c])
-        for c in range(d):
-            for a in range(p):
-                pulled[c, a] = 0.0
-                for e in range(d):
-                    pulled[c, a] += weight[k] * metric[k, c, e] * rows[e, a]
-        for a in range(p):
-            for c in range(d):
-                g[a] += pulled[c, a] * shift[k, c]
-                for b in range(p):
-                    H[a, b] += pulled[c, a] * rows[c, b]
-    step, held = solve_held((H + H.T) / 2, g, ratio)
+        add_pull(arm, metric[k], shift[k], weight[k], H, g)
+    H, g = of_dimension(d, H, g)
+    step, held = solve_held(H, g, ratio)
     return update_about(T, centre, step, radius, d), held
+
+
+@kernel
+def metric_of_pair(
+    d: int, T: FloatArray, target: FloatArray, moved: FloatArray, normal: FloatArray, source_normal: FloatArray,
+    plane_share: float, metric: FloatArray, shift: FloatArray,
+) -> float:  # fmt: skip
+    """Write metric (3, 3) and shift (3,) of a pair in the source frame; the length of the shift in the metric."""
+    turned = np.empty(3)
+    for a in range(3):
+        turned[a] = T[0, a] * normal[0] + T[1, a] * normal[1] + T[2, a] * normal[2]
+        shift[a] = 0.0
+        for b in range(d):
+            shift[a] += T[b, a] * (moved[b] - target[b])
+    flat_metric(d, turned, source_normal, plane_share, metric)
+    square = 0.0
+    for a in range(3):
+        for b in range(3):
+            square += shift[a] * metric[a, b] * shift[b]
+    return np.sqrt(square)
+
+
+@kernel
+def add_pull(
+    arm: FloatArray, metric: FloatArray, shift: FloatArray, weight: float, H: FloatArray, g: FloatArray
+) -> None:
+    """Add a pair, all in the source frame, to the Hessian (6, 6) and gradient (6,) in [turn, move].
+
+    A turn w moves the point by w x arm: with A = hat(arm) and metric M the blocks are A M A^T, A M and M.
+    """
+    x, y, z = arm[0], arm[1], arm[2]
+    AM, v = np.empty((3, 3)), np.empty(3)
+    for b in range(3):
+        AM[0, b] = weight * (y * metric[2, b] - z * metric[1, b])
+        AM[1, b] = weight * (z * metric[0, b] - x * metric[2, b])
+        AM[2, b] = weight * (x * metric[1, b] - y * metric[0, b])
+        v[b] = weight * (metric[b, 0] * shift[0] + metric[b, 1] * shift[1] + metric[b, 2] * shift[2])
+    g[0] += y * v[2] - z * v[1]
+    g[1] += z * v[0] - x * v[2]
+    g[2] += x * v[1] - y * v[0]
+    for a in range(3):
+        g[3 + a] += v[a]
+        H[a, 0] += y * AM[a, 2] - z * AM[a, 1]
+        H[a, 1] += z * AM[a, 0] - x * AM[a, 2]
+        H[a, 2] += x * AM[a, 1] - y * AM[a, 0]
+        for b in range(3):
+            H[a, 3 + b] += AM[a, b]
+            H[3 + b, a] += AM[a, b]
+            H[3 + a, 3 + b] += weight * metric[a, b]
+
+
+@kernel
+def of_dimension(d: int, H: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Hessian (p, p) and gradient (p,) from those of space in [turn, move]: in the plane [x, y, turn about z]."""
+    if d == 3:
+        return H, g
+    pick = (3, 4, 2)
+    small, short = np.empty((3, 3)), np.empty(3)
+    for a in range(3):
+        short[a] = g[pick[a]]
+        for b in range(3):
+            small[a, b] = H[pick[a], pick[b]]
+    return small, short

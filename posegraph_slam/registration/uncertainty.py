@@ -13,7 +13,9 @@ from posegraph_slam.registration.compiled_loop import (
     MEDIAN_3,
     PLANE,
     POINT,
-    flat_metric,
+    add_pull,
+    metric_of_pair,
+    of_dimension,
 )
 from posegraph_slam.registration.small_steps import centre_and_radius, robust_slope, robust_weight, tangent_row
 
@@ -36,9 +38,10 @@ def describe_pairs(
     count, p = len(s), 3 * (d - 1)
     centre, radius = centre_and_radius(source, s, count, d)
     jacobian, offset, length, weight = np.zeros((count, p)), np.zeros(count), np.zeros(count), np.zeros(count)
-    gaps, gap, arm, n, axis = np.zeros((count, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    gaps, gap, arm, n = np.zeros((count, 3)), np.zeros(3), np.zeros(3), np.zeros(3)
     whole = count if residual == GENERALISED else 0
-    rows, metrics, pulls = np.zeros((whole, 3, p)), np.zeros((whole, 3, 3)), np.zeros((whole, p))
+    arms, metrics, shifts = np.zeros((whole, 3)), np.zeros((whole, 3, 3)), np.zeros((whole, 3))
+    pulls, point = np.zeros((whole, p)), np.zeros(3)
     for k in range(count):
         square = 0.0
         for a in range(d):
@@ -60,22 +63,15 @@ def describe_pairs(
         elif residual == PLANE:
             length[k], weight[k] = abs(offset[k]), trust[t[k]]
         else:
-            for c in range(d):  # the shift along axis c of the target
-                for a in range(d):
-                    axis[a] = T[c, a]
-                tangent_row(d, arm, axis, rows[k, c])
             for a in range(3):
-                axis[a] = T[a, 0] * source_normals[s[k], 0] + T[a, 1] * source_normals[s[k], 1]
-                axis[a] += T[a, 2] * source_normals[s[k], 2]
-            flat_metric(d, normals[t[k]], axis, plane_share, metrics[k])
-            square, flatness = 0.0, 0.0
+                point[a] = gap[a] + target[t[k], a]
+            length[k] = metric_of_pair(d, T, target[t[k]], point, normals[t[k]], source_normals[s[k]], plane_share,
+                                       metrics[k], shifts[k])  # fmt: skip
+            arms[k] = arm
+            weight[k] = 0.0
             for a in range(d):
                 for b in range(d):
-                    square += gap[a] * metrics[k, a, b] * gap[b]
-                    flatness += normals[t[k], a] * metrics[k, a, b] * normals[t[k], b]
-                    for c in range(p):
-                        pulls[k, c] += rows[k, a, c] * metrics[k, a, b] * gap[b]
-            length[k], weight[k] = np.sqrt(square), flatness
+                    weight[k] += n[a] * metrics[k, a, b] * n[b]
     known, total, squares = 0.0, 0.0, 0.0
     for k in range(count):
         total += weight[k]
@@ -95,19 +91,22 @@ def describe_pairs(
             weight[k] *= robust
             if whole > 0:
                 metrics[k] *= robust
-                pulls[k] *= robust
             total += weight[k]
         slope = max(bent / (total + 1e-300), 0.1)
     H = np.zeros((p, p))
-    for k in range(count):
-        for a in range(p):
-            for b in range(p):
-                if whole == 0:
+    if whole > 0:
+        full, whole_pull = np.zeros((6, 6)), np.zeros(6)
+        for k in range(count):
+            whole_pull[:] = 0.0
+            add_pull(arms[k], metrics[k], shifts[k], 1.0, full, whole_pull)
+            for a in range(p):
+                pulls[k, a] = whole_pull[a] if d == 3 else whole_pull[(3, 4, 2)[a]]
+        H, _ = of_dimension(d, full, whole_pull)
+    else:
+        for k in range(count):
+            for a in range(p):
+                for b in range(p):
                     H[a, b] += weight[k] * jacobian[k, a] * jacobian[k, b]
-                    continue
-                for c in range(d):
-                    for e in range(d):
-                        H[a, b] += rows[k, c, a] * metrics[k, c, e] * rows[k, e, b]
     values, vectors = np.linalg.eigh(H)
     free = 0
     while free < p and values[free] <= max(ratio * values[p - 1], 2.2250738585072014e-308):
