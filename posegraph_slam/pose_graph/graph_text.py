@@ -1,7 +1,8 @@
 """Line records of pose-graph text files to arrays and back, the part that g2o and TORO files share.
 
-A record is a tag, one or two integer ids and a fixed number of reals. All reals of a tag are parsed in one call; a
-sentinel behind each line makes a line of wrong length show even where the total would fit.
+A record is a tag, one or two integer ids and a fixed number of reals. Files without a fault are parsed in compiled
+code. For others all reals of a tag are parsed in one call, where a sentinel behind each line makes a line of wrong
+length show even if the total would fit; then the faulty line is looked for.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import InputError
+from posegraph_slam.pose_graph.decimal_text import count_tags, parse_lines, powers_of_five
 
 SENTINEL = "inf"
 """Not finite, so that it can stand for no number of a valid record."""
@@ -45,7 +47,10 @@ def read_records(path: Path, formats: Mapping[str, RecordFormat]) -> dict[str, R
     Raises `InputError` naming file and line for an unknown tag, a wrong number of values or anything but numbers.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        data = path.read_bytes()
+        if (records := _parse_fast(data, formats)) is not None:
+            return records
+        text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, f"cannot be read ({error})", "give a pose-graph text file") from None
     rows: dict[str, list[str]] = {tag: [] for tag in formats}
@@ -64,6 +69,36 @@ def read_records(path: Path, formats: Mapping[str, RecordFormat]) -> dict[str, R
             rows[words[0]].append(words[1] if len(words) > 1 else "")
             lines[words[0]].append(number)
     return {tag: _parse(path, tag, rows[tag], lines[tag], formats[tag]) for tag in formats}
+
+
+def _parse_fast(data: bytes, formats: Mapping[str, RecordFormat]) -> dict[str, Records] | None:
+    """Parse a whole file in compiled code; None if anything in it is out of the ordinary, faults included."""
+    content = np.frombuffer(bytearray(data), np.uint8)
+    names = [name.encode() for name in formats]
+    tags = np.frombuffer(bytearray(b"".join(names)), np.uint8)
+    tag_start = np.concatenate([[0], np.cumsum([len(name) for name in names])])
+    odd, counts = count_tags(content, tags, tag_start)
+    if odd:
+        return None
+    id_counts = np.array([1 if layout.ids is None else layout.ids for layout in formats.values()])
+    real_counts = np.array([layout.reals for layout in formats.values()])
+    id_start, real_start, line_start = (
+        np.concatenate([[0], np.cumsum(counts * each)]) for each in (id_counts, real_counts, np.ones_like(counts))
+    )
+    ids, bits = np.empty(id_start[-1], np.int64), np.empty(real_start[-1], np.uint64)
+    lines = np.empty(line_start[-1], np.int64)
+    if not parse_lines(content, tags, tag_start, id_counts, real_counts, id_start, real_start, line_start,
+                       *powers_of_five(), ids, bits, lines):  # fmt: skip
+        return None
+    reals = bits.view(np.float64)
+    return {
+        name: Records(
+            ids=ids[id_start[k] : id_start[k + 1]].reshape(counts[k], id_counts[k]),
+            reals=reals[real_start[k] : real_start[k + 1]].reshape(counts[k], real_counts[k]),
+            lines=lines[line_start[k] : line_start[k + 1]],
+        )
+        for k, name in enumerate(formats)
+    }
 
 
 def _parse(path: Path, tag: str, rows: Sequence[str], lines: Sequence[int], layout: RecordFormat) -> Records:
