@@ -12,87 +12,101 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.geometry import SE2
 from posegraph_slam.loop_closure.settings import DriftSettings
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
+from posegraph_slam.pose_graph.marginals import Marginals, factored_marginals
 from posegraph_slam.pose_graph.residuals import constraint_jacobians
 from posegraph_slam.registration.beam_information import inverse
 
 RATES = 2
 """Systematic unknowns: heading per metre of travel, heading per radian of turn."""
-AT_ONCE = 64
-"""Pairs whose covariances are computed in one solve, to bound the memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LinearGraph:
     """A graph linearised at its poses, factorised, with the rates of systematic drift beside the poses.
 
-    `rates` (2,) are the most likely heading bias (rad/m) and turn scale of the chain, and `covariance` theirs.
+    `rates` (2,) are the most likely heading bias (rad/m) and turn scale of the chain, `rates_covariance` (2, 2) theirs;
+    `shift` (N, 3, 2) says how far each pose moves with the rates.
     """
 
     graph: PoseGraph
-    factor: SuperLU
+    marginals: Marginals
+    shift: FloatArray
     rates: FloatArray
     rates_covariance: FloatArray
 
     def relative_covariance(self, i: IntArray, j: IntArray) -> FloatArray:
-        """Covariance (M, 3, 3) of the motion from node i (M,) to node j (M,), in the tangent of its right update."""
+        """Covariance (M, 3, 3) of the motion from node i (M,) to node j (M,), in the tangent of its right update.
+
+        That of the poses given the rates, plus what the uncertain rates add to it (bordered system).
+        """
         group, poses = self.graph.group, self.graph.poses
         by_i = -group.adjoint(group.between(poses[j], poses[i]))
-        size = 3 * len(self.graph) + RATES
-        result = np.zeros((len(i), 3, 3))
-        for start in range(0, len(i), AT_ONCE):
-            rows = np.arange(start, min(start + AT_ONCE, len(i)))
-            pair = np.arange(len(rows))[:, None]
-            at_i, at_j = 3 * i[rows, None] + np.arange(3), 3 * j[rows, None] + np.arange(3)
-            columns = np.zeros((size, len(rows), 3))
-            columns[at_i, pair] = np.swapaxes(by_i[rows], 1, 2)
-            columns[at_j, pair] = np.eye(3)
-            solved = self.factor.solve(columns.reshape(size, -1)).reshape(size, len(rows), 3)
-            result[rows] = by_i[rows] @ solved[at_i, pair] + solved[at_j, pair]
-        return 0.5 * (result + np.swapaxes(result, 1, 2))
+        moved = by_i @ self.shift[i] + self.shift[j]
+        shared = moved @ self.rates_covariance @ np.swapaxes(moved, 1, 2)
+        return np.asarray(self.marginals.relative(i, j) + shared)
 
 
 def linearise(graph: PoseGraph, settings: DriftSettings) -> LinearGraph:
-    """Factorise the information of a connected SE(2) graph with fixed nodes, at its poses."""
+    """Factorise the information of a connected SE(2) graph with fixed nodes, at its poses.
+
+    With the system [[A, B], [B^T, C]] over poses and rates, the rates have information C - B^T A^-1 B, and the poses
+    move by -A^-1 B with them.
+    """
     c, count = graph.constraints, len(graph)
     residuals, by_i, by_j = constraint_jacobians(graph)
     chain = np.flatnonzero(~c.is_loop)
     by_rate = np.zeros((len(c), 3, RATES))
     by_rate[chain, 2] = -_exposure(c.select(chain))
-    blocks = ((by_i, 3 * c.i, 3), (by_j, 3 * c.j, 3), (by_rate, np.full(len(c), 3 * count), RATES))
-    rows, columns, values = [], [], []
-    gradient = np.zeros(3 * count + RATES)
-    for left, left_at, left_size in blocks:
-        weighted = np.swapaxes(left, 1, 2) @ c.information
-        at = left_at[:, None] + np.arange(left_size)
-        np.add.at(gradient, at, (weighted @ residuals[..., None])[..., 0])
-        for right, right_at, right_size in blocks:
-            block = weighted @ right
-            shape = (len(c), left_size, right_size)
-            rows.append(np.broadcast_to(at[:, :, None], shape).ravel())
-            to = right_at[:, None] + np.arange(right_size)
-            columns.append(np.broadcast_to(to[:, None, :], shape).ravel())
-            values.append(block.ravel())
-    held = np.concatenate([np.repeat(np.where(graph.fixed, 1e12, 1e-9), 3), _prior(settings)])
-    diagonal = np.arange(3 * count + RATES)
-    system = coo_array(
-        (np.concatenate([*values, held]), (np.concatenate([*rows, diagonal]), np.concatenate([*columns, diagonal]))),
-        shape=(3 * count + RATES,) * 2,
-    ).tocsc()
-    factor = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    unit = np.zeros((3 * count + RATES, RATES))
-    unit[-RATES:] = np.eye(RATES)
+    border, gradient = np.zeros((count, 3, RATES)), np.zeros((count, 3))
+    for rows, jacobian in ((c.i, by_i), (c.j, by_j)):
+        weighted = np.swapaxes(jacobian, 1, 2) @ c.information
+        np.add.at(border, rows, weighted @ by_rate)
+        np.add.at(gradient, rows, (weighted @ residuals[..., None])[..., 0])
+    weighted = np.swapaxes(by_rate, 1, 2) @ c.information
+    corner = np.sum(weighted @ by_rate, axis=0) + np.diag(_prior(settings))
+    corner_gradient = np.sum(weighted @ residuals[..., None], axis=0)[:, 0]
+    solved = _solve_poses(graph, by_i, by_j, np.concatenate([border, gradient[..., None]], axis=2))
+    shift = -solved[..., :RATES]
+    information = corner + np.einsum("npr,nps->rs", border, shift)
+    covariance = np.linalg.inv(0.5 * (information + information.T))
+    left = corner_gradient + np.einsum("npr,np->r", shift, gradient)
     return LinearGraph(
         graph=graph,
-        factor=factor,
-        rates=-factor.solve(gradient)[-RATES:],
-        rates_covariance=factor.solve(unit)[-RATES:],
+        marginals=factored_marginals(graph),
+        shift=shift,
+        rates=-covariance @ left,
+        rates_covariance=covariance,
     )
+
+
+def _solve_poses(graph: PoseGraph, by_i: FloatArray, by_j: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve the normal equations of the poses for right sides (N, 3, k); fixed nodes stay."""
+    c, count = graph.constraints, len(graph)
+    parts = ((by_i, 3 * c.i), (by_j, 3 * c.j))
+    rows, columns, values = [], [], []
+    for left, left_at in parts:
+        weighted = np.swapaxes(left, 1, 2) @ c.information
+        for other, other_at in parts:
+            block = weighted @ other
+            rows.append(np.broadcast_to((left_at[:, None] + np.arange(3))[:, :, None], block.shape).ravel())
+            columns.append(np.broadcast_to((other_at[:, None] + np.arange(3))[:, None, :], block.shape).ravel())
+            values.append(block.ravel())
+    free = np.flatnonzero(np.repeat(~graph.fixed, 3))
+    size = 3 * count
+    system = coo_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, size)
+    ).tocsc()[free][:, free]
+    result = np.zeros((size, right.shape[2]))
+    if len(free):
+        factor = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        result[free] = factor.solve(right.reshape(size, -1)[free])
+    return result.reshape(count, 3, -1)
 
 
 def innovation(linear: LinearGraph, constraints: Constraints, covariance: FloatArray) -> FloatArray:
