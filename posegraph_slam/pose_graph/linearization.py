@@ -42,6 +42,14 @@ def jacobians_at(poses: FloatArray, constraints: Constraints) -> tuple[FloatArra
     return residuals, by_i, by_j
 
 
+def moved_poses(poses: FloatArray, rows: IntArray, delta: FloatArray) -> FloatArray:
+    """Return poses (N, d+1, d+1) with those at `rows` (n,) updated on the right by exp(delta), delta (n, p)."""
+    result = np.array(poses)
+    run = _planar_moves if poses.shape[-1] == 3 else _spatial_moves
+    run(result, rows, delta)
+    return result
+
+
 def _writable(poses: FloatArray) -> FloatArray:
     """Return a copy of read-only poses: numba would compile every kernel a second time for them."""
     return poses if poses.flags.writeable else np.array(poses)
@@ -194,6 +202,57 @@ def _planar_jacobians(poses: FloatArray, i: IntArray, j: IntArray, T: FloatArray
             by_i[e, row, 0] = -(j0 * cn - j1 * sn)
             by_i[e, row, 1] = -(j0 * sn + j1 * cn)
             by_i[e, row, 2] = -(j0 * ty - j1 * tx + j2)
+
+
+@kernel
+def _planar_moves(poses: FloatArray, rows: IntArray, delta: FloatArray) -> None:
+    for k in range(len(rows)):
+        T, theta = poses[rows[k]], delta[k, 2]
+        if abs(theta) < SMALL_ANGLE_RAD:
+            a, b = 1.0 - theta * theta / 6.0, 0.5 * theta
+        else:
+            a, b = np.sin(theta) / theta, 2.0 * np.sin(0.5 * theta) ** 2 / theta
+        x, y = a * delta[k, 0] - b * delta[k, 1], b * delta[k, 0] + a * delta[k, 1]
+        c, s = T[0, 0], T[1, 0]
+        T[0, 2] += c * x - s * y
+        T[1, 2] += s * x + c * y
+        cd, sd = np.cos(theta), np.sin(theta)
+        c, s = c * cd - s * sd, s * cd + c * sd
+        T[0, 0], T[0, 1], T[1, 0], T[1, 1] = c, -s, s, c
+
+
+@kernel
+def _spatial_moves(poses: FloatArray, rows: IntArray, delta: FloatArray) -> None:
+    """With K = hat(phi): R <- R (1 + a K + b K^2), t <- t + R (1 + b K + c K^2) rho."""
+    turn, shift, old = np.empty(3), np.empty(3), np.empty((3, 3))
+    for k in range(len(rows)):
+        T, phi, rho = poses[rows[k]], delta[k, :3], delta[k, 3:]
+        square = phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2
+        if square < SMALL_SQUARE:
+            a = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
+            b = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)))
+            c = 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0 * (1.0 - square / 110.0)))
+        else:
+            angle = np.sqrt(square)
+            a, b = np.sin(angle) / angle, 2.0 * np.sin(0.5 * angle) ** 2 / square
+            c = (1.0 - a) / square
+        for r in range(3):
+            for m in range(3):
+                old[r, m] = T[r, m]
+        for column in range(4):
+            v0 = rho[0] if column == 3 else (1.0 if column == 0 else 0.0)
+            v1 = rho[1] if column == 3 else (1.0 if column == 1 else 0.0)
+            v2 = rho[2] if column == 3 else (1.0 if column == 2 else 0.0)
+            turn[0] = phi[1] * v2 - phi[2] * v1
+            turn[1] = phi[2] * v0 - phi[0] * v2
+            turn[2] = phi[0] * v1 - phi[1] * v0
+            first, second = (b, c) if column == 3 else (a, b)
+            shift[0] = v0 + first * turn[0] + second * (phi[1] * turn[2] - phi[2] * turn[1])
+            shift[1] = v1 + first * turn[1] + second * (phi[2] * turn[0] - phi[0] * turn[2])
+            shift[2] = v2 + first * turn[2] + second * (phi[0] * turn[1] - phi[1] * turn[0])
+            for r in range(3):
+                value = old[r, 0] * shift[0] + old[r, 1] * shift[1] + old[r, 2] * shift[2]
+                T[r, column] = T[r, 3] + value if column == 3 else value
 
 
 @kernel

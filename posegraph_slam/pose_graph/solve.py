@@ -12,8 +12,7 @@ from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pose_graph.checks import check_graph
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
 from posegraph_slam.pose_graph.gtsam_solver import chosen_ordering, run_gtsam
-from posegraph_slam.pose_graph.linearization import jacobians_at, normal_equations, squared_lengths
-from posegraph_slam.pose_graph.residuals import chi2
+from posegraph_slam.pose_graph.linearization import jacobians_at, normal_equations, residuals_at, squared_lengths
 from posegraph_slam.pose_graph.robust import RobustSettings, constraint_costs, constraint_weights
 from posegraph_slam.pose_graph.solver_settings import (
     EliminationOrdering,
@@ -24,7 +23,7 @@ from posegraph_slam.pose_graph.solver_settings import (
     SolverSettings,
     StopReason,
 )
-from posegraph_slam.pose_graph.sparse_solver import run_sparse
+from posegraph_slam.pose_graph.sparse_solver import cost_at, run_sparse
 
 OPTIMALITY_TOLERANCE = 1e-6
 """Largest share of the cost that a move of the nodes one by one may still promise at an optimum."""
@@ -79,7 +78,7 @@ def chosen_kind(settings: SolverSettings) -> SolverKind:
 def graph_cost(graph: PoseGraph, robust: RobustSettings | None = None) -> float:
     """Return the cost of a graph at its poses: half the sum of chi-square, with the loss on loops if given."""
     robust = RobustSettings() if robust is None else robust
-    return float(np.sum(constraint_costs(graph.constraints.is_loop, chi2(graph), robust)))
+    return cost_at(graph, graph.poses, robust)
 
 
 def possible_decrease(graph: PoseGraph, robust: RobustSettings | None = None) -> float:
@@ -160,7 +159,7 @@ def _result(
     notes: tuple[str, ...],
 ) -> SolveResult:
     poses = np.where(graph.fixed[:, None, None], graph.poses, run.poses)
-    squared = chi2(graph.with_poses(poses))
+    squared = squared_lengths(residuals_at(poses, graph.constraints), graph.constraints.information)
     cost = float(np.sum(constraint_costs(graph.constraints.is_loop, squared, settings.robust)))
     reason = run.stop_reason
     if optimal and reason is not StopReason.MAX_ITERATIONS:

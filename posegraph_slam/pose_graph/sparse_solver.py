@@ -15,7 +15,13 @@ from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.execution import Progress
 from posegraph_slam.pose_graph.block_cholesky import BlockPattern, block_pattern, factorize, solve_factored
 from posegraph_slam.pose_graph.graph import PoseGraph
-from posegraph_slam.pose_graph.linearization import jacobians_at, normal_equations, residuals_at, squared_lengths
+from posegraph_slam.pose_graph.linearization import (
+    jacobians_at,
+    moved_poses,
+    normal_equations,
+    residuals_at,
+    squared_lengths,
+)
 from posegraph_slam.pose_graph.robust import RobustSettings, constraint_costs, constraint_weights
 from posegraph_slam.pose_graph.solver_settings import (
     IterationRecord,
@@ -113,8 +119,7 @@ def _step(
         factor = factorize(system.pattern, linear.diagonal, linear.off_diagonal, damping)
         if factor is not None:
             delta = -solve_factored(system.pattern, factor, linear.gradient)
-            moved = np.array(poses)
-            moved[system.rows] = graph.group.retract(poses[system.rows], delta)
+            moved = moved_poses(poses, system.rows, delta)
             now = cost_at(graph, moved, settings.robust)
             predicted = 0.5 * float(np.sum(delta * (damping * delta - linear.gradient)))
             if now < cost and (not damped or cost - now > LEAST_FIDELITY * predicted):

@@ -14,6 +14,7 @@ from posegraph_slam.pose_graph.elimination import analyze, minimum_degree
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
 from posegraph_slam.pose_graph.linearization import (
     jacobians_at,
+    moved_poses,
     normal_equations,
     residuals_at,
     squared_lengths,
@@ -168,3 +169,13 @@ def test_a_graph_of_fixed_nodes_is_left_alone(graph: PoseGraph) -> None:
     result = solve(held)
     assert result.stop_reason is StopReason.ALREADY_OPTIMAL
     np.testing.assert_array_equal(result.poses, held.poses)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-4, 0.05, 0.2, 1.0, 3.0])
+def test_moves_are_right_updates(group: Group, scale: float) -> None:
+    rng = np.random.default_rng(0)
+    poses = group.exp(rng.normal(size=(50, group.dof)))
+    rows, delta = np.arange(3, 40), scale * rng.normal(size=(37, group.dof))
+    expected = np.array(poses)
+    expected[rows] = group.retract(poses[rows], delta)
+    np.testing.assert_allclose(moved_poses(poses, rows, delta), expected, rtol=1e-13, atol=1e-13)
