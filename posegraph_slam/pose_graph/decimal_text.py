@@ -131,7 +131,7 @@ def _number(data: Bytes, at: int, upper5: UIntArray, lower5: UIntArray) -> tuple
             at += 1
         exponent, first = 0, at
         while at < size and data[at] >= DIGIT0 and data[at] <= DIGIT9 and at - first < 5:
-            exponent = exponent * 10 + np.int64(data[at]) - DIGIT0
+            exponent = exponent * 10 + int(data[at]) - DIGIT0
             at += 1
         if at == first:
             return ODD, at, ZERO
@@ -208,7 +208,7 @@ def parse_lines(data: Bytes, tags: Bytes, tag_start: IntArray, id_counts: IntArr
                     at += 1
                 first, value = at, 0
                 while at < size and data[at] >= DIGIT0 and data[at] <= DIGIT9:
-                    value = value * 10 + np.int64(data[at]) - DIGIT0
+                    value = value * 10 + int(data[at]) - DIGIT0
                     at += 1
                 if at == first or at - first > 18 or (at < size and data[at] > SPACE):
                     return False

@@ -76,6 +76,6 @@ def _best(graph: PoseGraph) -> tuple[FloatArray, Start]:
         settled = len(costs) < 2 or costs[-2] - costs[-1] <= SETTLED * costs[-1]
         if start is Start.CHORDAL and settled:
             limit = float(costs[-1])
-    cost = [entry[0] if np.isfinite(entry[0]) else np.inf for entry in found]
-    _, poses, winner = found[int(np.argmin(cost))]
+    ranked = [entry[0] if np.isfinite(entry[0]) else np.inf for entry in found]
+    _, poses, winner = found[int(np.argmin(ranked))]
     return poses, winner
