@@ -23,6 +23,7 @@ FILES = {
     "config.toml",
     "metrics.json",
     "odometry.tum",
+    "scan_matching.npz",
     "scan_matching.tum",
     "trajectory.tum",
     "graph.g2o",
@@ -168,3 +169,18 @@ def test_default_folder_is_named_after_the_log(log_name: str, name: str, tmp_pat
     else:
         path.mkdir(parents=True)
     assert default_out(path) == Path("runs") / name
+
+
+def test_stages_and_reruns_from_the_command_line(run: Path, tmp_path: Path) -> None:
+    again = CliRunner().invoke(app, ["optimize", str(run), "--from", "graph", "--out", str(tmp_path / "again"), "-q"])
+    assert again.exit_code == 0
+    assert (tmp_path / "again/trajectory.tum").read_bytes() == (run / "trajectory.tum").read_bytes()
+    short = ["optimize", str(run), "--from", "graph", "--no-loops", "--stages", "odometry,matching"]
+    assert CliRunner().invoke(app, [*short, "--out", str(tmp_path / "short"), "-q"]).exit_code == 0
+    assert not (tmp_path / "short/maps").exists()
+    wrong = CliRunner().invoke(app, ["optimize", str(run), "--from", "maps"])
+    assert wrong.exit_code == 2
+    assert "it is matching or graph" in wrong.stderr
+    wrong = CliRunner().invoke(app, ["optimize", str(run), "--stages", "loops"])
+    assert wrong.exit_code == 2
+    assert "'loops' is not a stage" in wrong.stderr

@@ -38,7 +38,10 @@ def plan(log: RobotLog, *overrides: str) -> str:
 
 def test_source_of_the_odometry(log: RobotLog) -> None:
     assert "without odometry" in plan(log)
-    assert "the robot logged" in plan(dataclasses.replace(log, odometry=TRAJECTORY))
+    moving = np.array(TRAJECTORY.poses)
+    moving[:, 0, 2] = np.arange(len(moving))
+    assert "the robot logged" in plan(dataclasses.replace(log, odometry=TRAJECTORY.with_poses(moving)))
+    assert "without odometry" in plan(dataclasses.replace(log, odometry=TRAJECTORY))
     ticks = np.zeros((3, 2), np.int64)
     encoders = WheelEncoders(
         stamps_s=STAMPS, ticks_left=ticks, ticks_right=ticks, metres_per_tick=0.01, track_width_m=0.5

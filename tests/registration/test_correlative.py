@@ -100,7 +100,7 @@ def test_a_wide_window_is_searched_to_the_true_pose() -> None:
         assert abs(error[2]) < 0.05
         assert score > 0.5
         assert not rival
-    pose, score, rival = search_pose(32, np.array([30]), np.zeros((1, 3)), start, 2.0, 0.8, 0.999, *arrays)
+    pose, score, _ = search_pose(32, np.array([30]), np.zeros((1, 3)), start, 2.0, 0.8, 0.999, *arrays)
     assert score == 0.0
     np.testing.assert_array_equal(pose, start)
 
@@ -111,7 +111,7 @@ def test_nothing_to_compare_scores_zero(empty: str) -> None:
     kind = np.ones((2, 40), dtype=np.uint8)
     kind[0 if empty == "source" else 1] = 0
     start = np.array([1.0, 2.0, 0.3])
-    pose, score, rival = search_pose(
+    pose, score, _ = search_pose(
         0, np.array([1]), np.zeros((1, 3)), start, 1.0, 0.5, 0.1, LocalSearchSettings().vector(),
         points, kind, kind > 0,
     )  # fmt: skip
