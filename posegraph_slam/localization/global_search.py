@@ -44,7 +44,7 @@ def find_places(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the best poses (P, 3) in the grid frame for `points` (n, 2) (base frame), and their scores (P,) in [0, 1].
 
-    Best first, at most `peaks_max`, each further than the separation from better ones. Empty where nothing scores
+    Best first, at most `candidates_max`, each further than the separation from better ones. Empty where nothing scores
     `score_min`, or there are fewer than ten points.
     """
     points = points[np.hypot(points[:, 0], points[:, 1]) <= settings.range_max_m]
@@ -58,7 +58,7 @@ def find_places(
     cells = rotated_cells(points, start, angles, np.zeros(2), stack.resolution_m, 1 << LEVELS)
     gaps = np.array([settings.separation_m / stack.resolution_m, settings.separation_rad / turn])
     least = int(settings.score_min * FIELD_MAX * len(points))
-    found, scores = search_peaks(stack.likelihood, stack.free, cells, gaps, least, settings.peaks_max)
+    found, scores = search_peaks(stack.likelihood, stack.free, cells, gaps, least, settings.candidates_max)
     poses = np.column_stack([(found[:, 1:] + 0.5) * stack.resolution_m, angles[found[:, 0]]])
     return poses, scores / (FIELD_MAX * len(points))
 

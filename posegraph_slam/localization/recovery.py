@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.geometry import SE2, pose_from_xyt, xyt_from_pose
-from posegraph_slam.localization.beam_model import add_log_likelihoods
+from posegraph_slam.localization.beam_model import agreement, refine
 from posegraph_slam.localization.filter_state import FilterState, PreparedMap
 from posegraph_slam.localization.global_search import find_places
 from posegraph_slam.localization.motion import step_sigmas
 from posegraph_slam.localization.particles import around, joined, merged
-from posegraph_slam.localization.resampling import resample
+from posegraph_slam.localization.resampling import normalised, resample
 from posegraph_slam.localization.settings import LocalizationSettings
-from posegraph_slam.registration.beam_matching import between
+from posegraph_slam.registration.beam_matching import between, compose
+
+SCANS_LOOKED_AT = 6
+AGREE_LOG_ODDS, CONFLICT_LOG_ODDS = math.log(0.9 / 0.25), math.log(0.1 / 0.75)
+"""At right places 90 % of the telling returns agree, at wrong ones a quarter (measured on intel and fr079)."""
 
 
 def recover(
@@ -29,21 +34,16 @@ def recover(
     state = replace(state, updates_since_search=0)
     if len(places) == 0:
         return state
-    field = known.field
-    log_weights = np.zeros(len(places))
-    kept = np.ascontiguousarray(points[:: -(-len(points) // settings.beam_model.points_max)])
-    add_log_likelihoods(
-        places, kept, field.log_likelihood, field.outside, field.geometry.resolution_m,
-        settings.beam_model.beam_weight, log_weights,
-    )  # fmt: skip
+    log_weights = place_log_weights(state, known, places, settings)
+    best = np.argsort(-log_weights, kind="stable")[: settings.search.peaks_max]
+    places, weights = places[best], normalised(log_weights[best])
     each = max(int(settings.search.share * settings.number.maximum / settings.search.peaks_max), 10)
     step = known.stack.resolution_m
     sigmas = np.array([step, step, settings.search.angle_step_rad * 2])
-    weights = np.exp(log_weights - log_weights.max())
     share = settings.search.share if state.next_hypothesis > 1 else 1.0 - 1e-9
     parts = [
         around(place, sigmas, each, state.next_hypothesis + k, rng).with_log_weights(
-            np.full(each, np.log(share * weights[k] / weights.sum() / each + 1e-300))
+            np.full(each, np.log(share * weights[k] / each + 1e-300))
         )
         for k, place in enumerate(places)
     ]
@@ -53,6 +53,32 @@ def recover(
     old = old.with_log_weights(np.full(len(old), np.log((1 - share) / len(old))))
     particles = merged(joined([old, *parts]), settings.search.separation_m, settings.search.separation_rad)
     return replace(state, particles=particles, next_hypothesis=state.next_hypothesis + len(places))
+
+
+def place_log_weights(
+    state: FilterState, known: PreparedMap, places: FloatArray, settings: LocalizationSettings
+) -> FloatArray:
+    """Return log-weights (P,) of places from how far some of the last scans agree with the map there.
+
+    Conflicts tell more than the score of the search: walls seen through, and returns in free space. A place that
+    reaches into unknown space scores little, yet does not conflict.
+    """
+    field, scale = known.field, settings.beam_model.beam_weight
+    looked_at = state.recent[::-1][:: max(len(state.recent) // SCANS_LOOKED_AT, 1)]
+    newest = state.recent[-1][1]
+    log_weights = np.zeros(len(places))
+    for k, place in enumerate(places):
+        pose = refine(
+            newest.points, newest.normals, place, np.eye(3), settings.match.vector(), field.nearest, field.lines,
+            field.distance_m, field.geometry.resolution_m,
+        )[0]  # fmt: skip
+        for odometry, scan in looked_at:
+            agree, conflict = agreement(
+                scan.sparse, scan.sensor, compose(pose, between(state.odometry, odometry)), settings.health.agreement_m,
+                field.kind, field.distance_m, field.geometry.resolution_m,
+            )  # fmt: skip
+            log_weights[k] += scale * (AGREE_LOG_ODDS * agree + CONFLICT_LOG_ODDS * conflict)
+    return log_weights
 
 
 def recent_points(state: FilterState, settings: LocalizationSettings) -> FloatArray:

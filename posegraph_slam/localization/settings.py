@@ -89,14 +89,16 @@ class GlobalSearchSettings(Settings):
     """Width of the map's obstacles in the search."""
     range_max_m: float = Field(default=12.0, gt=0)
     """Returns further away are left out."""
-    points_max: int = Field(default=200, ge=20)
+    points_max: int = Field(default=120, ge=20)
     """The last scans are represented by at most this many points."""
     angle_step_rad: float = Field(default=0.02, gt=0, lt=1)
     """Smallest step in heading."""
     score_min: float = Field(default=0.3, ge=0, lt=1)
     """Least mean likelihood of the points at a candidate."""
+    candidates_max: int = Field(default=100, ge=1)
+    """Best places by score that are looked at closely,"""
     peaks_max: int = Field(default=30, ge=1)
-    """Candidates that become hypotheses."""
+    """and how many of them, by how far they agree with the map, become hypotheses."""
     separation_m: float = Field(default=0.8, gt=0)
     """Candidates nearer than this,"""
     separation_rad: float = Field(default=0.35, gt=0)
