@@ -12,7 +12,6 @@ from posegraph_slam.cli.arguments import Json, Quiet
 from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table, print_warning
 
 if TYPE_CHECKING:
-    from posegraph_slam.pose_graph.graph import PoseGraph
     from posegraph_slam.pose_graph.optimum import Optimum
 
 Graph = Annotated[Path, typer.Argument(metavar="GRAPH", help="Pose graph: .g2o, .graph or .toro.")]
@@ -106,7 +105,7 @@ def solve(
     seconds = {"read": read_s, **optimum.seconds, "write": time.perf_counter() - began}
     asked = covariances(optimum, marginal or [], relative or [])
     if plot is not None:
-        draw(whole, optimum, plot, graph.name)
+        draw(optimum, plot, graph.name)
     if as_json:
         print_json(summary(graph, optimum, seconds, notes) | asked)
     elif not quiet:
@@ -116,8 +115,8 @@ def solve(
         print_warning(f"no optimum was reached: {optimum.stop_reason}")
 
 
-def draw(whole: PoseGraph, optimum: Optimum, path: Path, name: str) -> None:
-    """Draw the solution over the poses given."""
+def draw(optimum: Optimum, path: Path, name: str) -> None:
+    """Draw the solution."""
     from posegraph_slam.report.graph_figure import draw_graph
 
     draw_graph(optimum.graph, path, kept=optimum.kept, title=f"{name}: {optimum.error:.9g}")
@@ -141,7 +140,9 @@ def summary(graph: Path, optimum: Optimum, seconds: dict[str, float], notes: lis
         "lower_bound": None if certificate is None else certificate.lower_bound,
         "seconds": {key: round(value, 6) for key, value in seconds.items()},
         "status": "unknown" if certificate is None else certificate.status.value,
-        "reason": "no certificate was asked for" if certificate is None else certificate.reason,
+        "reason": "no certificate was asked for, or a robust loss has none"
+        if certificate is None
+        else certificate.reason,
         "gap": None if certificate is None or certificate.rank == 0 else certificate.gap,
         "notes": [*notes, *optimum.notes],
     }
