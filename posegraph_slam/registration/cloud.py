@@ -10,7 +10,7 @@ import numpy as np
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.jit import kernel
-from posegraph_slam.registration.kd_tree import KdTree, in_space, split_points
+from posegraph_slam.registration.kd_tree import KdTree, build_kd_tree, in_space
 
 LINE_TOLERANCE = 1e-12
 """Share of the largest variance under which the next one is rounding: the points lie on one line."""
@@ -50,13 +50,12 @@ class Cloud:
     """Points (n, d), d = 2 or 3, with their KD-tree and surface; `spans_plane` unless all lie on one spot or line.
     `in_space` (n, 3) are the points with a zero as third coordinate in the plane.
 
-    Made by `prepare_cloud`; a scan that is matched twice is prepared once. The surface is fitted when first asked for
-    (a source needs it in generalised ICP alone), for which the record keeps a dictionary instead of slots.
+    Made by `prepare_cloud`; a scan that is matched twice is prepared once. Tree and surface are made when
+    first asked for (a source needs them in few cases), for which the record keeps a dictionary instead of slots.
     """
 
     points: FloatArray
     in_space: FloatArray
-    tree: KdTree
     spans_plane: bool
     neighbours: int
 
@@ -67,6 +66,11 @@ class Cloud:
     def dimension(self) -> int:
         """2 or 3."""
         return int(self.points.shape[1])
+
+    @cached_property
+    def tree(self) -> KdTree:
+        """KD-tree of the points."""
+        return build_kd_tree(self.in_space)
 
     @cached_property
     def normals_in_space(self) -> FloatArray:
@@ -87,32 +91,43 @@ def prepare_cloud(points: FloatArray, *, neighbours: int = 10) -> Cloud:
     checked = read_only(points)
     if checked.ndim != 2 or checked.shape[1] not in (2, 3):
         raise InputError("point set", f"has shape {checked.shape}", "give an array (points, 2) or (points, 3)")
-    padded, finite, spans_plane, rows, leaves, axis, value = prepare_points(checked)
+    padded, finite, spans_plane = prepare_points(checked)
     if not finite:
         bad = int(np.count_nonzero(~np.isfinite(checked).all(axis=1)))
         raise InputError("point set", f"{bad} of {len(checked)} points are not finite", "remove them before matching")
-    tree = KdTree(rows=rows, sorted_points=leaves, axis=axis, value=value)
-    return Cloud(points=checked, in_space=read_only(padded), tree=tree, spans_plane=spans_plane, neighbours=neighbours)
+    return Cloud(points=checked, in_space=read_only(padded), spans_plane=spans_plane, neighbours=neighbours)
 
 
 @kernel
-def prepare_points(
-    points: FloatArray,
-) -> tuple[FloatArray, bool, bool, IntArray, FloatArray, IntArray, FloatArray]:
-    """Points (n, 3), whether all are finite, whether they span a plane, and the arrays of their KD-tree."""
+def prepare_points(points: FloatArray) -> tuple[FloatArray, bool, bool]:
+    """Points (n, 3), whether all are finite, and whether they span a plane."""
     n, d = points.shape
     padded, finite = np.zeros((n, 3)), True
     for row in range(n):
         for a in range(d):
             padded[row, a] = points[row, a]
             finite = finite and np.isfinite(points[row, a])
-    wide = finite and _spans_plane(points)
-    rows, axis, value = split_points(padded if finite else padded[:0])
-    leaves = np.empty((len(rows), 3))
+    return padded, finite, finite and _spans_plane(points)
+
+
+def normals_at(cloud: Cloud, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Normals (n, 3) and thickness (n,) at some rows of a cloud, zero elsewhere: cheaper than its whole surface."""
+    index = cloud.tree.neighbours(cloud.in_space[rows], min(cloud.neighbours, len(cloud)))
+    return scatter_normals(cloud.in_space, rows, *fit_neighbourhoods(cloud.points, index)[1:4])
+
+
+@kernel
+def scatter_normals(
+    points: FloatArray, rows: IntArray, normals: FloatArray, oriented: BoolArray, thickness: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Put normals (k, d) and thickness (k,) where `rows` (k,) say, into (n, 3) and (n,)."""
+    everywhere, thick = np.zeros(points.shape), np.zeros(len(points))
     for k in range(len(rows)):
-        for a in range(3):
-            leaves[k, a] = padded[rows[k], a]
-    return padded, finite, wide, rows, leaves, axis, value
+        if oriented[k]:
+            thick[rows[k]] = thickness[k]
+            for a in range(normals.shape[1]):
+                everywhere[rows[k], a] = normals[k, a]
+    return everywhere, thick
 
 
 def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
@@ -171,17 +186,17 @@ def neighbourhood_moments(points: FloatArray, neighbours: IntArray) -> tuple[Flo
     means, covariances = np.zeros((n, d)), np.zeros((n, d, d))
     for row in range(n):
         for j in range(k):
-            for a in range(d):  # relative to the point itself: no digits are lost far from the origin
-                means[row, a] += (points[neighbours[row, j], a] - points[row, a]) / k
+            for a in range(d):  # relative to the nearest: no digits are lost far from the origin
+                means[row, a] += (points[neighbours[row, j], a] - points[neighbours[row, 0], a]) / k
         for j in range(k):
             for a in range(d):
                 for b in range(d):
                     covariances[row, a, b] += (
-                        (points[neighbours[row, j], a] - points[row, a] - means[row, a])
-                        * (points[neighbours[row, j], b] - points[row, b] - means[row, b]) / k
+                        (points[neighbours[row, j], a] - points[neighbours[row, 0], a] - means[row, a])
+                        * (points[neighbours[row, j], b] - points[neighbours[row, 0], b] - means[row, b]) / k
                     )  # fmt: skip
         for a in range(d):
-            means[row, a] += points[row, a]
+            means[row, a] += points[neighbours[row, 0], a]
     return means, covariances
 
 

@@ -17,6 +17,8 @@ from posegraph_slam.registration.small_steps import (
 )
 
 POINT, PLANE, GENERALISED = 0, 1, 2
+"""Residuals in the order of `ResidualKind`."""
+
 CONVERGED, MAX_ITERATIONS, TOO_FEW_INLIERS, DEGENERATE = 0, 1, 2, 3
 
 MEDIAN_1, MEDIAN_2, MEDIAN_3 = MEDIAN_OF_NORM[1], MEDIAN_OF_NORM[2], MEDIAN_OF_NORM[3]
@@ -30,12 +32,13 @@ def run_loop(
 ) -> tuple[FloatArray, int, int, IntArray, IntArray]:  # fmt: skip
     """Register source (n, 3) onto target (m, 3): pose (4, 4), status, rounds, and the rows (k,) of the last pairs.
 
-    `options` as `options_of` gives them. A pose that comes back, within the tolerances, to one of an earlier round
-    runs in a circle of pairings (Brent 1980 finds it): it is as settled as it will be.
+    `residual`, `loss` and `options` come from `IcpSettings.for_kernels`. A pose that comes back,
+    within the tolerances, to one of an earlier round runs in a circle of pairings (Brent 1980 finds it): it is as
+    settled as it will be.
     """
     gate, keep, scale_given, rounds, turn_limit, move_limit = options[:6]
-    least_pairs, ratio, plane_share = options[6], options[7], options[8]
-    n = len(source)
+    ratio, plane_share, n = options[7], options[8], len(source)
+    least_pairs = max(options[6], options[11] * n)
     T, remembered, power, lap = start.copy(), start.copy(), 1, 0
     partner, spare, moved = np.full(n, -1, dtype=np.int64), np.zeros(n), np.zeros((n, 3))
     s, t = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
@@ -295,7 +298,7 @@ def metric_of_pair(
     for a in range(3):
         for b in range(3):
             square += shift[a] * metric[a, b] * shift[b]
-    return np.sqrt(square)
+    return float(np.sqrt(square))
 
 
 @kernel

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3
-from posegraph_slam.registration.cloud import Cloud, prepare_cloud
+from posegraph_slam.registration.cloud import Cloud, normals_at, prepare_cloud
 from posegraph_slam.registration.compiled_loop import (
     CONVERGED,
     DEGENERATE,
-    GENERALISED,
     MAX_ITERATIONS,
-    PLANE,
-    POINT,
     TOO_FEW_INLIERS,
     run_loop,
 )
@@ -29,19 +27,17 @@ from posegraph_slam.registration.uncertainty import describe_pairs
 
 DEFAULT_SETTINGS = IcpSettings()
 
-RESIDUALS = {
-    ResidualKind.POINT_TO_POINT: POINT,
-    ResidualKind.POINT_TO_PLANE: PLANE,
-    ResidualKind.GENERALISED: GENERALISED,
-}
-LOSSES = {loss: number for number, loss in enumerate(Loss)}
 STATUSES = {
     CONVERGED: RegistrationStatus.CONVERGED,
     MAX_ITERATIONS: RegistrationStatus.MAX_ITERATIONS,
     TOO_FEW_INLIERS: RegistrationStatus.TOO_FEW_INLIERS,
     DEGENERATE: RegistrationStatus.DEGENERATE,
 }
-NO_NORMALS = read_only(np.zeros((1, 3)))
+NO_NORMALS, NO_TRUST = read_only(np.zeros((1, 3))), read_only(np.zeros(1))
+NO_NEIGHBOURS = np.zeros((1, 1), dtype=np.int64)
+
+SPEAKING_PAIRS = 100
+"""Pairs at most, evenly, that describe a point-to-point result: fitting normals to all costs more than the loop."""
 
 
 def icp(
@@ -77,13 +73,12 @@ def runs_compiled(settings: IcpSettings) -> bool:
 def _run_compiled(source: Cloud, target: Cloud, T: FloatArray, settings: IcpSettings) -> RegistrationResult:
     """Run the loop as one kernel."""
     d, tree = source.dimension, target.tree
-    start = pose_in_space(T, d)
-    residual, loss, options = options_of(settings, len(source))
-    surface = target.surface
+    residual, loss, options = settings.for_kernels
+    shape = _shape_of(target, settings)
     found, status, iterations, s, t = run_loop(
-        d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value,
-        surface.anchors, target.normals_in_space, surface.trust, _source_normals(source, settings), start, residual,
-        loss, options)  # fmt: skip
+        d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value, shape.anchors,
+        shape.normals, shape.trust, _source_normals(source, settings), pose_in_space(T, d), residual, loss,
+        options)  # fmt: skip
     if status in (TOO_FEW_INLIERS, DEGENERATE):
         return failed(STATUSES[status], d, pairs=len(s), iterations=iterations)
     return _described(found, source, target, s, t, settings, STATUSES[status], iterations)
@@ -172,15 +167,25 @@ def _checked_pose(T_target_source: FloatArray, source: Cloud, target: Cloud) -> 
     return T
 
 
-def options_of(settings: IcpSettings, points: int) -> tuple[int, int, FloatArray]:
-    """Residual and loss as numbers, and the other settings in the order that the kernels expect."""
-    least = max(settings.min_inliers, settings.min_inlier_fraction * points)
-    options = np.array([
-        settings.max_distance_m, settings.keep_fraction, settings.loss_scale_m or 0.0, settings.max_iterations,
-        settings.rotation_tolerance_rad, settings.translation_tolerance_m, least, settings.degeneracy_ratio,
-        settings.plane_share, settings.sigma_floor_m, settings.free_sigma_m,
-    ])  # fmt: skip
-    return RESIDUALS[settings.residual], LOSSES[settings.loss], options
+class Shape(NamedTuple):
+    """What the kernels know of the target about its points; point-to-point needs no anchors, trust and neighbours."""
+
+    anchors: FloatArray
+    normals: FloatArray
+    trust: FloatArray
+    thickness_m: FloatArray
+    neighbours: IntArray
+
+
+POINTS_ALONE = Shape(NO_NORMALS, NO_NORMALS, NO_TRUST, NO_TRUST, NO_NEIGHBOURS)
+
+
+def _shape_of(target: Cloud, settings: IcpSettings) -> Shape:
+    """Lines or planes of the target, where the residual leans on them."""
+    if settings.residual is ResidualKind.POINT_TO_POINT:
+        return POINTS_ALONE
+    surface = target.surface
+    return Shape(surface.anchors, target.normals_in_space, surface.trust, surface.thickness_m, surface.neighbours)
 
 
 def _source_normals(source: Cloud, settings: IcpSettings) -> FloatArray:
@@ -207,18 +212,21 @@ def _described(
     status: RegistrationStatus, iterations: int,
 ) -> RegistrationResult:  # fmt: skip
     """Measure the pairs of rows s and t (m,) at the final pose (4, 4)."""
-    d, surface = source.dimension, target.surface
-    residual, loss, options = options_of(settings, len(source))
+    d, shape, pairs = source.dimension, _shape_of(target, settings), len(s)
+    if shape is POINTS_ALONE:  # normals only describe the result here: some of the pairs can speak for all
+        step = -(-pairs // SPEAKING_PAIRS)
+        s, t = s[::step].copy(), t[::step].copy()
+        normals, thickness = normals_at(target, t)
+        shape = Shape(NO_NORMALS, normals, NO_TRUST, thickness, NO_NEIGHBOURS)
     information, free, _, rmse = describe_pairs(
-        d, T, source.in_space, target.in_space, surface.anchors, target.normals_in_space, surface.trust,
-        surface.thickness_m, surface.neighbours, _source_normals(source, settings), s, t, residual, loss,
-        options)  # fmt: skip
+        d, T, source.in_space, target.in_space, *shape, _source_normals(source, settings), s, t,
+        *settings.for_kernels, len(s) / pairs)  # fmt: skip
     pose = T if d == 3 else in_plane(T)
     return RegistrationResult(
         T_target_source=pose,
         status=status,
-        inliers=len(s),
-        inlier_fraction=len(s) / len(source),
+        inliers=pairs,
+        inlier_fraction=pairs / len(source),
         rmse_m=rmse,
         information=information,
         degenerate_directions=free,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from enum import StrEnum
+from functools import cached_property
 
 from pydantic import Field
 
+from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.settings import Settings
 
 
@@ -78,6 +80,16 @@ class IcpSettings(Settings):
     """The residuals' standard deviation is taken as no smaller, so that perfect data are not infinitely certain."""
     free_sigma_m: float = Field(default=1.0, gt=0)
     """Standard deviation given to directions that the points leave free: the floor under the information."""
+
+    @cached_property
+    def for_kernels(self) -> tuple[int, int, FloatArray]:
+        """Residual and loss as numbers, and the other values in the order that the kernels expect."""
+        options = [
+            self.max_distance_m, self.keep_fraction, self.loss_scale_m or 0.0, self.max_iterations,
+            self.rotation_tolerance_rad, self.translation_tolerance_m, self.min_inliers, self.degeneracy_ratio,
+            self.plane_share, self.sigma_floor_m, self.free_sigma_m, self.min_inlier_fraction,
+        ]  # fmt: skip
+        return list(ResidualKind).index(self.residual), list(Loss).index(self.loss), read_only(options)
 
     @classmethod
     def point_to_point(cls) -> IcpSettings:

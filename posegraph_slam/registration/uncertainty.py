@@ -24,14 +24,15 @@ from posegraph_slam.registration.small_steps import centre_and_radius, robust_sl
 def describe_pairs(
     d: int, T: FloatArray, source: FloatArray, target: FloatArray, anchors: FloatArray, normals: FloatArray,
     trust: FloatArray, thickness: FloatArray, neighbours: IntArray, source_normals: FloatArray, s: IntArray,
-    t: IntArray, residual: int, loss: int, options: FloatArray,
+    t: IntArray, residual: int, loss: int, options: FloatArray, share: float,
 ) -> tuple[FloatArray, FloatArray, int, float]:  # fmt: skip
     """Information (p, p) at the source origin, eigenvectors (p, p) of which the first few are free, how many, and RMSE.
 
     The covariance is H^-1 M H^-1 (Huber 1967; White 1980), in a frame about the pairs' centre in which turns are
     measured on their radius. M sums the outer products of the scores of the source points, each with its own residual,
     and of the target points, each of which moves every pair that leans on it. With independent residuals of one
-    variance that is sigma^2 H^-1. Directions whose share of H is under the ratio are free and get `free_sigma_m`.
+    variance that is sigma^2 H^-1. The pairs given are the `share` of all that they speak for.
+    Directions whose part of H is under the ratio are free and get `free_sigma_m`.
     """
     scale_given, floor, ratio, plane_share = options[2], options[5], options[7], options[8]
     sigma_floor, free_sigma = options[9], options[10]
@@ -48,11 +49,11 @@ def describe_pairs(
             moved = T[a, 3]
             for b in range(d):
                 moved += T[a, b] * source[s[k], b]
-            gaps[k, a] = moved - anchors[t[k], a]
             gap[a] = moved - target[t[k], a]
+            gaps[k, a] = moved - anchors[t[k], a] if residual == PLANE else gap[a]
             square += gap[a] ** 2
             arm[a] = (source[s[k], a] - centre[a]) / radius
-            offset[k] += (gap[a] if residual == GENERALISED else gaps[k, a]) * normals[t[k], a]
+            offset[k] += gaps[k, a] * normals[t[k], a]
             n[a] = 0.0
             for b in range(d):
                 n[a] += T[b, a] * normals[t[k], b]
@@ -120,10 +121,12 @@ def describe_pairs(
     if whole > 0:
         middle_part = raw_score_products(scores, pulls @ np.ascontiguousarray(vectors[:, free:]), t, neighbours,
                                          sigma_floor)  # fmt: skip
+    elif residual == POINT:
+        middle_part = point_score_products(scores, length, thickness, t, slope, sigma_floor)
     else:
         middle_part = score_products(d, scores, offset, length, gaps, thickness, anchors, target, normals, neighbours,
-                                     t, residual, slope, sigma_floor)  # fmt: skip
-    freedom = count / max(count - held, 1)
+                                     t, slope, sigma_floor)  # fmt: skip
+    freedom = share * count / max(count - held, 1)
     covariance = np.zeros((held, held))
     for i in range(held):
         for j in range(held):
@@ -151,7 +154,7 @@ def describe_pairs(
 @kernel
 def score_products(
     d: int, scores: FloatArray, offset: FloatArray, length: FloatArray, gaps: FloatArray, thickness: FloatArray,
-    anchors: FloatArray, target: FloatArray, normals: FloatArray, neighbours: IntArray, t: IntArray, residual: int,
+    anchors: FloatArray, target: FloatArray, normals: FloatArray, neighbours: IntArray, t: IntArray,
     slope: float, sigma_floor: float,
 ) -> FloatArray:  # fmt: skip
     """Sum M (h, h) of the outer products of all points' scores, each times the deviation of its point.
@@ -166,25 +169,22 @@ def score_products(
     leaning = np.zeros((len(target), held))
     M = np.zeros((held, held))
     inverse, gap = np.zeros((3, 3)), np.zeros(3)
-    reach = residual == PLANE
     for k in range(count):
         sigma = max(length[k], sigma_floor)
         for a in range(held):
             for b in range(held):
                 M[a, b] += scores[k, a] * scores[k, b] * sigma * sigma * k_all / (k_all + 1)
         sigma = slope * max(thickness[t[k]], sigma_floor)
-        if reach:
-            tangent_inverse(d, target, anchors[t[k]], normals[t[k]], neighbours[t[k]], inverse)
-            for a in range(d):
-                gap[a] = 0.0
-                for b in range(d):
-                    gap[a] += inverse[a, b] * gaps[k, b]
+        tangent_inverse(d, target, anchors[t[k]], normals[t[k]], neighbours[t[k]], inverse)
+        for a in range(d):
+            gap[a] = 0.0
+            for b in range(d):
+                gap[a] += inverse[a, b] * gaps[k, b]
         for j in neighbours[t[k]]:
             share, lever = 0.0, 1.0
             for a in range(d):
                 share += normals[t[k], a] * normals[j, a]
-                if reach:
-                    lever += gap[a] * (target[j, a] - anchors[t[k], a])
+                lever += gap[a] * (target[j, a] - anchors[t[k], a])
             share *= sigma * lever / k_all
             for a in range(held):
                 leaning[j, a] += share * scores[k, a]
@@ -200,6 +200,29 @@ def score_products(
                 M[a, b] += leaning[row, a] * leaning[row, b]
                 near[a, b] += shared[row, a] * shared[row, b] / k_all
     return larger_of(M, near)
+
+
+@kernel
+def point_score_products(
+    scores: FloatArray, length: FloatArray, thickness: FloatArray, t: IntArray, slope: float, sigma_floor: float
+) -> FloatArray:
+    """Sum M (h, h) for point-to-point: each pair by its whole length, and by its target's noise with all that share it.
+
+    Tangential distances come from the sampling, not from noise, yet they are what moves point-to-point.
+    """
+    count, held = scores.shape
+    leaning, M = np.zeros((len(thickness), held)), np.zeros((held, held))
+    for k in range(count):
+        sigma, noise = max(length[k], sigma_floor), slope * max(thickness[t[k]], sigma_floor)
+        for a in range(held):
+            leaning[t[k], a] += noise * scores[k, a]
+            for b in range(held):
+                M[a, b] += scores[k, a] * scores[k, b] * sigma * sigma
+    for row in range(len(leaning)):
+        for a in range(held):
+            for b in range(held):
+                M[a, b] += leaning[row, a] * leaning[row, b]
+    return M
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,13 +10,14 @@ import pytest
 from scipy.linalg import subspace_angles
 from scipy.stats import chi2
 
-from posegraph_slam.geometry import SE2, SE3, pose_from_xyt
+from posegraph_slam.datasets.clouds import read_cloud
+from posegraph_slam.geometry import SE2, SE3, pose_from_xyt, transform_points
 from posegraph_slam.registration import IcpSettings, RegistrationStatus, icp
 
 TRIALS = 200
 
 
-@pytest.mark.parametrize(("beams", "sigma_m"), [(181, 0.01), (361, 0.01)])
+@pytest.mark.parametrize(("beams", "sigma_m"), [(181, 0.01), (361, 0.02), (1081, 0.01), (1081, 0.02)])
 def test_information_is_calibrated_in_rooms(beams: int, sigma_m: float, simulated: SimpleNamespace) -> None:
     rng, nees = np.random.default_rng(1), []
     for _ in range(TRIALS):
@@ -84,3 +86,19 @@ def test_more_noise_means_less_information(simulated: SimpleNamespace) -> None:
     ratios = np.array(sizes[:-1]) / sizes[1:]
     assert (ratios > 4.0**3 / 3).all()
     assert (ratios < 4.0**3 * 3).all()
+
+
+@pytest.mark.data
+def test_information_is_calibrated_on_real_scans(psg_data: Path) -> None:
+    points = read_cloud(psg_data / "clouds" / "lidar_pair" / "target.ply").points
+    rng, nees = np.random.default_rng(1), []
+    for _ in range(TRIALS):
+        first, second = np.split(points[rng.permutation(len(points))[:5000]], 2)
+        truth = SE3.exp(rng.normal(0, [0.05] * 3 + [0.2] * 3))
+        moved = transform_points(SE3.inverse(truth), second)
+        target, source = (p + rng.normal(0, 0.01, p.shape) for p in (first, moved))
+        result = icp(source, target, truth @ SE3.exp(rng.normal(0, [0.02] * 3 + [0.1] * 3)), IcpSettings.generalised())
+        error = SE3.local(result.T_target_source, truth)
+        nees.append(float(error @ result.information @ error))
+    low, high = chi2.ppf([0.025, 0.975], 6 * TRIALS) / TRIALS
+    assert low < np.mean(nees) < high
