@@ -251,7 +251,8 @@ def _smallest(pattern: BlockPattern, factor: FloatArray, shift: float, n: int, d
         return solve_factored(pattern, factor, right)
 
     operator = LinearOperator((n * d, n * d), matvec=lambda x: inverse(x)[:, :d].ravel(), dtype=np.float64)
-    begin = np.random.default_rng(0).normal(size=n * d)
+    rng = np.random.default_rng(0)
+    begin = rng.normal(size=n * d)
     values, vectors = eigsh(operator, k=1, which="LM", v0=begin, tol=1e-6)
     full = inverse(vectors[:, 0])
     return float(1.0 / values[0] - shift), full / np.max(np.abs(full[:, :d]))
