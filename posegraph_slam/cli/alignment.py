@@ -58,7 +58,9 @@ def icp(
     if folder is not None and model is not None:
         raise InputError("psg icp", "was given both files and --folder", "give one of them")
     kind = StartKind.ROTATIONS if yaw is None else StartKind.YAW
-    settings = GlobalSearchSettings(starts=kind, rotations=yaw or rotations, keep_fraction=keep)
+    # a tilted object is shown as badly as turns about z leave it
+    limit = GlobalSearchSettings().rmse_limit_share if yaw is None else 1.0
+    settings = GlobalSearchSettings(starts=kind, rotations=yaw or rotations, keep_fraction=keep, rmse_limit_share=limit)
     tasks = tasks_of_folder(folder) if folder is not None else (task_of_files(model, clouds or []),) if model else ()
     began = time.perf_counter()
     with ProgressBars(enabled=not quiet) as progress:

@@ -36,7 +36,7 @@ STATUSES = {
 NO_NORMALS, NO_TRUST = read_only(np.zeros((1, 3))), read_only(np.zeros(1))
 NO_NEIGHBOURS = np.zeros((1, 1), dtype=np.int64)
 
-SPEAKING_PAIRS = 100
+SPEAKING_PAIRS = 64
 """Pairs at most, evenly, that describe a point-to-point result: fitting normals to all costs more than the loop."""
 
 
