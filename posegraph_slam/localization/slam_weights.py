@@ -66,7 +66,7 @@ def window_scores(particles, points, M, near, half):  # type: ignore[no-untyped-
     rows, columns = near.shape
     width = 2 * half + 1
     scores = np.zeros(len(particles))
-    sums = np.zeros((width, width), np.int64)
+    sums = np.zeros((width, width), np.int32)
     for k in range(len(particles)):
         c, s = np.cos(particles[k, 2]), np.sin(particles[k, 2])
         sums[:] = 0
@@ -77,10 +77,12 @@ def window_scores(particles, points, M, near, half):  # type: ignore[no-untyped-
             row = int(np.floor(M[1, 0] * x + M[1, 1] * y + M[1, 2]))
             if not (0 <= row < rows and 0 <= column < columns) or near[row, column] > 2 * half * half:
                 continue  # no obstacle within the window
-            for dy in range(max(-half, -row), min(half + 1, rows - row)):
-                for dx in range(max(-half, -column), min(half + 1, columns - column)):
-                    if near[row + dy, column + dx] == 0:
-                        sums[dy + half, dx + half] += 1
+            if row < half or row >= rows - half or column < half or column >= columns - half:
+                continue  # the grid is made so large that nothing that is seen lies at its edge
+            for dy in range(width):
+                line, counts = near[row + dy - half, column - half : column + half + 1], sums[dy]
+                for dx in range(width):  # without a branch, so that it runs on vectors
+                    counts[dx] += np.int32(line[dx] == 0)
         scores[k] = sums.max()
     return scores
 
