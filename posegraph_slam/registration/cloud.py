@@ -225,7 +225,7 @@ def least_axes_in_plane(covariances: FloatArray) -> tuple[FloatArray, FloatArray
 def least_axes_in_space(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least eigenvectors (n, 3) and rising eigenvalues (n, 3) of (n, 3, 3) by cyclic Jacobi turns (Golub, 8.5).
 
-    Ten times as fast as LAPACK on matrices this small, and exact to rounding.
+    Ten times as fast as LAPACK on matrices this small; an axis is off by 1e-12 rad at most.
     """
     n = len(covariances)
     axes, values = np.empty((n, 3)), np.empty((n, 3))
@@ -237,7 +237,7 @@ def least_axes_in_space(covariances: FloatArray) -> tuple[FloatArray, FloatArray
                 V[i, j] = 1.0 if i == j else 0.0
         for _ in range(12):
             off = A[0, 1] ** 2 + A[0, 2] ** 2 + A[1, 2] ** 2
-            if off <= 1e-32 * (A[0, 0] ** 2 + A[1, 1] ** 2 + A[2, 2] ** 2):
+            if off <= 1e-24 * (A[0, 0] ** 2 + A[1, 1] ** 2 + A[2, 2] ** 2):
                 break
             for p in range(2):
                 for q in range(p + 1, 3):

@@ -10,7 +10,15 @@ import pytest
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3, Group, inverse_pose, transform_points
-from posegraph_slam.registration import IcpSettings, Loss, RegistrationStatus, ResidualKind, icp, prepare_cloud
+from posegraph_slam.registration import (
+    AssociationKind,
+    IcpSettings,
+    Loss,
+    RegistrationStatus,
+    ResidualKind,
+    icp,
+    prepare_cloud,
+)
 
 POINT, PLANE = ResidualKind.POINT_TO_POINT, ResidualKind.POINT_TO_PLANE
 matchers = pytest.mark.parametrize(
@@ -216,6 +224,22 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         icp(plane.ravel(), plane, np.eye(3))
     with pytest.raises(InputError, match="shape"):
         icp(np.zeros((9, 5)), plane, np.eye(3))
+
+
+@spaces
+@pytest.mark.parametrize("residual", list(ResidualKind))
+@pytest.mark.parametrize(("loss", "keep"), [(Loss.NONE, 0.8), (Loss.HUBER, 1.0), (Loss.CAUCHY, 0.9),
+                                            (Loss.GEMAN_MCCLURE, 1.0), (Loss.TUKEY, 0.9)])  # fmt: skip
+def test_the_compiled_loop_is_the_loop_of_parts(group: Group, residual: ResidualKind, loss: Loss, keep: float) -> None:
+    target, source = surface(group), surface(group, 7)
+    compiled, parts = (
+        icp(source, target, motion(group, 0.05, 1),
+            IcpSettings(residual=residual, loss=loss, keep_fraction=keep, association=association, max_iterations=40))
+        for association in (None, AssociationKind.KD_TREE)
+    )  # fmt: skip
+    assert (compiled.status, compiled.iterations, compiled.inliers) == (parts.status, parts.iterations, parts.inliers)
+    np.testing.assert_allclose(compiled.T_target_source, parts.T_target_source, atol=1e-9)
+    np.testing.assert_allclose(compiled.information, parts.information, rtol=1e-5, atol=1e-3)
 
 
 def test_too_few_steps_are_told() -> None:
