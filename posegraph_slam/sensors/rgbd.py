@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray, read_only
+from posegraph_slam.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,8 +56,11 @@ class RgbdFrames:
         return any(self.disparity_files) and any(self.colour_files)
 
     def nearest_colour(self, stamps_s: FloatArray) -> IntArray:
-        """Index (n,) of the colour frame nearest in time to each stamp."""
+        """Index (n,) of the colour frame nearest in time to each stamp; raises InputError where there are none."""
         clock = self.colour_stamps_s
-        after = np.clip(np.searchsorted(clock, stamps_s), 1, max(len(clock) - 1, 1))
-        earlier = stamps_s - clock[after - 1] < clock[after] - stamps_s
-        return np.asarray(after - earlier, dtype=np.int64)
+        if len(clock) == 0:
+            raise InputError("rgbd", "has no colour frames", "the texture map needs colour images")
+        after = np.clip(np.searchsorted(clock, stamps_s), min(1, len(clock) - 1), len(clock) - 1)
+        before = np.maximum(after - 1, 0)
+        earlier = stamps_s - clock[before] < clock[after] - stamps_s
+        return np.asarray(np.where(earlier, before, after), dtype=np.int64)
