@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from posegraph_slam.loop_closure.closing import LoopClosureResult, close_loops
 from posegraph_slam.loop_closure.ledger import LoopRecord
 from posegraph_slam.loop_closure.refinement import refine_overlaps
 from posegraph_slam.mapping.crispness import crispness
-from posegraph_slam.mapping.occupancy import OccupancyGrid, build_occupancy
+from posegraph_slam.mapping.occupancy import OccupancyGrid, OccupancySettings, build_occupancy
 from posegraph_slam.mapping.texture import TextureMap, build_texture
 from posegraph_slam.odometry.scan_matching import ScanMatchingResult, match_scans
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
@@ -102,7 +103,7 @@ def optimize(
             optimised = smooth(optimised, matched.scan_information, odometry)
     stages = dict(zip(STAGES, (odometry.trajectory, matched.trajectory, in_map_frame(optimised)), strict=True))
     with clock.stage("maps"):
-        maps = _maps(scans, stages, configuration, progress)
+        maps = _maps(scans, stages, configuration, executor, progress)
         texture = _texture(log, stages["optimised"], maps.get("optimised"), configuration, executor, progress)
     with clock.stage("evaluation"):
         measured = {
@@ -172,15 +173,23 @@ def _refine(
 
 
 def _maps(
-    scans: LaserScans, stages: Mapping[str, Trajectory], configuration: Configuration, progress: Progress
+    scans: LaserScans,
+    stages: Mapping[str, Trajectory],
+    configuration: Configuration,
+    executor: Executor,
+    progress: Progress,
 ) -> dict[str, OccupancyGrid]:
     """Build the occupancy map of each stage, so that their crispness can be compared."""
     if not configuration.maps:
         return {}
-    return {
-        name: build_occupancy(scans, trajectory, configuration.mapping, progress=progress)
-        for name, trajectory in stages.items()
-    }
+    build = partial(_occupancy, scans=scans, settings=configuration.mapping, progress=progress)
+    return dict(zip(stages, executor.map(build, stages.values()), strict=True))
+
+
+def _occupancy(
+    trajectory: Trajectory, *, scans: LaserScans, settings: OccupancySettings, progress: Progress
+) -> OccupancyGrid:
+    return build_occupancy(scans, trajectory, settings, progress=progress)
 
 
 def usable_scans(log: RobotLog) -> LaserScans:
