@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from posegraph_slam.arrays import BoolArray, FloatArray, read_only
+from posegraph_slam.errors import GraphError
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pose_graph.certificate import Certificate, CertificateStatus, certify, with_status
 from posegraph_slam.pose_graph.checks import check_graph
@@ -121,7 +122,7 @@ def _start(graph: PoseGraph, start: Start, *, robust: bool) -> tuple[FloatArray,
         odometry = graph.with_constraints(graph.constraints.select(~graph.constraints.is_loop))
         try:
             return starting_poses(odometry, Start.ODOMETRY)
-        except Exception:
+        except GraphError:  # without its loops the graph falls apart
             return starting_poses(graph, Start.ODOMETRY)
     return starting_poses(graph, start)
 
