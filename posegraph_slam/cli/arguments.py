@@ -22,4 +22,6 @@ Config = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else on stdout.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Run directory.")]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print remarks and the time of each stage too.")]

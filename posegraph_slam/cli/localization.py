@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Set
-from posegraph_slam.cli.console import ProgressBars, print_json, print_note
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set
+from posegraph_slam.cli.console import ProgressBars
+from posegraph_slam.cli.runs import report
 
 if TYPE_CHECKING:
     from posegraph_slam.arrays import FloatArray
-    from posegraph_slam.pipeline.localize import LocalizationSummary
+    from posegraph_slam.pipeline.recording import RunOutcome
 
 Map = Annotated[Path, typer.Argument(metavar="MAP", help="YAML file of a nav2 map.")]
 
@@ -20,7 +21,7 @@ Map = Annotated[Path, typer.Argument(metavar="MAP", help="YAML file of a nav2 ma
 def localize(
     known_map: Map,
     log: Log,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Run directory.")],
+    out: Out,
     start: Annotated[
         str | None,
         typer.Option("--start", metavar="X,Y,YAW", help="Pose of the first scan (m, rad); without it, search the map."),
@@ -28,7 +29,7 @@ def localize(
     config: Config = None,
     settings: Set = None,
     log_format: Format = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")] = None,
+    seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -49,10 +50,7 @@ def localize(
             log_format=log_format,
             progress=progress,
         )
-    if as_json:
-        print_json({"folder": str(summary.folder), "metrics": summary.metrics, "run": summary.record})
-    elif not quiet:
-        print_summary(summary)
+    report(summary, show, quiet=quiet, as_json=as_json)
 
 
 def parse_pose(text: str) -> FloatArray:
@@ -70,14 +68,11 @@ def parse_pose(text: str) -> FloatArray:
     return values
 
 
-def print_summary(summary: LocalizationSummary) -> None:
-    """Print when the pose was known, then where the results lie; remarks go to stderr."""
-    for remark in summary.remarks:
-        print_note(remark)
-    metrics = summary.metrics
+def show(outcome: RunOutcome) -> None:
+    """Print when the pose was known, and how well."""
+    metrics = outcome.metrics
     counts = ", ".join(f"{count} {name}" for name, count in reversed(metrics["health"].items()))
     typer.echo(f"scans     {metrics['scans']} ({counts})")
     if metrics["first_known_s"] is not None:
         typer.echo(f"known     from {metrics['first_known_s']:.1f} s on, lost {metrics['times_lost']} times")
         typer.echo(f"sigma     {metrics['median_position_sigma_m']:.3f} m (median of the position)")
-    typer.echo(f"\nresults:  {summary.folder}")

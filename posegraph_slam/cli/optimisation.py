@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Set, Verbose
-from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Seed, Set, Verbose
+from posegraph_slam.cli.console import ProgressBars, print_table
+from posegraph_slam.cli.runs import report
 
 if TYPE_CHECKING:
     from posegraph_slam.pipeline.run import RunSummary
@@ -21,7 +23,7 @@ def optimize(
     settings: Set = None,
     truth: Annotated[Path | None, typer.Option("--truth", help="TUM file of true poses to compare with.")] = None,
     log_format: Format = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")] = None,
+    seed: Seed = None,
     workers: Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")] = None,
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Close no loops: scan matching alone.")] = False,
     stages: Annotated[
@@ -57,10 +59,9 @@ def optimize(
             draw=draw_figures,
             progress=progress,
         )
-    if as_json:
-        print_json({"folder": str(summary.folder), "metrics": summary.metrics, "run": summary.record})
-    elif not quiet:
-        print_summary(summary, verbose=verbose)
+    report(summary, partial(show, verbose=verbose), quiet=quiet, as_json=as_json)
+    for picture in () if quiet or as_json else sorted(summary.folder.glob("figures/*.png")):
+        typer.echo(f"picture:  {picture}")
 
 
 def default_out(log: Path) -> Path:
@@ -70,10 +71,8 @@ def default_out(log: Path) -> Path:
     return Path("runs") / (name or "log")
 
 
-def print_summary(summary: RunSummary, *, verbose: bool) -> None:
-    """Print the comparison of the stages, then where the results lie; remarks go to stderr."""
-    for remark in summary.remarks:
-        print_note(remark)
+def show(summary: RunSummary, *, verbose: bool) -> None:
+    """Print the comparison of the stages, and with `verbose` the time each took."""
     print_table(summary.table.as_text_rows())
     if verbose:
         record = summary.record
@@ -82,6 +81,3 @@ def print_summary(summary: RunSummary, *, verbose: bool) -> None:
         typer.echo(
             f"of this compiling {record['jit_compile_s']:.1f} s; peak memory {record['peak_memory_mib']:.0f} MiB"
         )
-    typer.echo(f"\nresults:  {summary.folder}")
-    for picture in sorted(summary.folder.glob("figures/*.png")):
-        typer.echo(f"picture:  {picture}")

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING
 
-import typer
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set
+from posegraph_slam.cli.console import ProgressBars, print_table
+from posegraph_slam.cli.runs import report
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Set
-from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table
+if TYPE_CHECKING:
+    from posegraph_slam.pipeline.recording import RunSummary
 
 
 def pf_slam(
     log: Log,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Run directory.")],
+    out: Out,
     config: Config = None,
     settings: Set = None,
     log_format: Format = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")] = None,
+    seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -31,10 +32,9 @@ def pf_slam(
         summary = run_particle_slam(
             log, configuration, out=out, overwrite=overwrite, log_format=log_format, progress=progress
         )
-    if as_json:
-        print_json({"folder": str(summary.folder), "metrics": summary.metrics, "run": summary.record})
-    elif not quiet:
-        for remark in summary.remarks:
-            print_note(remark)
-        print_table(summary.table.as_text_rows())
-        typer.echo(f"\nresults:  {summary.folder}")
+    report(summary, show, quiet=quiet, as_json=as_json)
+
+
+def show(summary: RunSummary) -> None:
+    """Print the comparison with odometry."""
+    print_table(summary.table.as_text_rows())

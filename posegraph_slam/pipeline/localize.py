@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray
-from posegraph_slam.datasets import read
 from posegraph_slam.datasets.tum import write_tum
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.geometry import Trajectory
-from posegraph_slam.jit import measure_compile_time
 from posegraph_slam.localization.health import Health
 from posegraph_slam.localization.known_map import LocalizationResult, localize, prepare_map
 from posegraph_slam.mapping.nav2 import read_nav2
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.odometry.scan_matching import match_scans
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
-from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.optimize import usable_scans
-from posegraph_slam.pipeline.run_directory import METRICS, RECORD, RunDirectory, create_run_directory, require_free
-from posegraph_slam.pipeline.run_record import fingerprint, run_record
+from posegraph_slam.pipeline.recording import RunOutcome, recorded_run
+from posegraph_slam.pipeline.run_directory import METRICS, RunDirectory
+from posegraph_slam.pipeline.run_record import fingerprint
 from posegraph_slam.registration.beam_scans import BeamScans, prepare_beam_scans
 from posegraph_slam.sensors import RobotLog
 
@@ -33,16 +30,6 @@ STATES = "localization.csv"
 COLUMNS = (
     "stamp_s", "health", "agreement", "share", "particles", "cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocalizationSummary:
-    """What a localisation gave: its folder, metrics and record, and remarks for people."""
-
-    folder: Path
-    metrics: Mapping[str, Any]
-    record: Mapping[str, Any]
-    remarks: tuple[str, ...]
 
 
 def motion_of_log(log: RobotLog, configuration: Configuration) -> tuple[BeamScans, Trajectory, tuple[str, ...]]:
@@ -83,35 +70,24 @@ def run_localization(
     log_format: str | None = None,
     progress: Progress = silent_progress,
     command: Sequence[str] | None = None,
-) -> LocalizationSummary:
+) -> RunOutcome:
     """Localise the log at `log_path` in the nav2 map at `map_path` and leave the result in the run directory `out`.
 
     Raises InputError where `out` is taken, or map or log cannot be used; nothing is then left.
     """
-    require_free(out, overwrite=overwrite)
-    clock = StageClock()
-    with create_run_directory(out, overwrite=overwrite) as directory:
-        with measure_compile_time() as compiling:
-            with clock.stage("reading"):
-                grid, log = read_nav2(map_path), read(log_path, format=log_format)
-            with clock.stage("localisation"):
-                result, remarks = localize_log(grid, log, configuration, start=start, progress=progress)
-        with clock.stage("saving"):
-            directory.write_configuration(configuration)
-            save_localization(result, directory)
-            metrics = summarise(result)
-            directory.write_json(METRICS, metrics)
-        record = run_record(
-            configuration,
-            log_path,
-            log_format=log.format,
-            stages_s=clock.seconds,
-            jit_compile_s=compiling.seconds,
-            command=command,
-        )
-        record["map"] = fingerprint(map_path)
-        directory.write_json(RECORD, record)
-    return LocalizationSummary(folder=out, metrics=metrics, record=record, remarks=remarks)
+    with recorded_run(
+        log_path, configuration, out=out, overwrite=overwrite, log_format=log_format, command=command
+    ) as run:
+        with run.clock.stage("reading"):
+            grid = read_nav2(map_path)
+            run.inputs["map"] = fingerprint(map_path)
+        with run.clock.stage("localisation"):
+            result, remarks = localize_log(grid, run.log, configuration, start=start, progress=progress)
+        metrics = summarise(result)
+        with run.clock.stage("saving"):
+            save_localization(result, run.directory)
+            run.directory.write_json(METRICS, metrics)
+    return RunOutcome(folder=out, metrics=metrics, record=run.record, remarks=remarks)
 
 
 def save_localization(result: LocalizationResult, directory: RunDirectory) -> None:

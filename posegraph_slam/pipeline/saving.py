@@ -9,6 +9,7 @@ from posegraph_slam.loop_closure.ledger import LoopRecord
 from posegraph_slam.mapping.archive import write_occupancy
 from posegraph_slam.mapping.images import write_png
 from posegraph_slam.mapping.nav2 import map_pixels, write_nav2
+from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.mapping.texture import texture_pixels
 from posegraph_slam.pipeline.matching_file import MATCHING, write_matching
 from posegraph_slam.pipeline.optimize import OptimizationResult
@@ -49,12 +50,17 @@ def save_loops(result: OptimizationResult, directory: RunDirectory) -> None:
 
 
 def save_maps(result: OptimizationResult, directory: RunDirectory) -> None:
-    """Write the occupancy map for nav2, for eyes and exactly, and the texture map where there is one."""
+    """Write the occupancy map, and the texture map where there is one."""
     if result.occupancy is None:
         return
-    folder = directory.path("maps/map.pgm").parent
-    write_nav2(result.occupancy, folder)
-    write_png(map_pixels(result.occupancy), folder / "map.png")
-    write_occupancy(result.occupancy, folder / "map.npz")
+    save_occupancy(result.occupancy, directory)
     if result.texture is not None:
-        write_png(texture_pixels(result.texture), folder / "texture.png")
+        write_png(texture_pixels(result.texture), directory.path("maps/texture.png"))
+
+
+def save_occupancy(occupancy: OccupancyGrid, directory: RunDirectory) -> None:
+    """Write an occupancy map for nav2, for eyes and exactly."""
+    folder = directory.path("maps/map.pgm").parent
+    write_nav2(occupancy, folder)
+    write_png(map_pixels(occupancy), folder / "map.png")
+    write_occupancy(occupancy, folder / "map.npz")

@@ -1,0 +1,85 @@
+"""What every run has around its own work: a directory that appears when all is written, a clock, and a record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from posegraph_slam.datasets import read
+from posegraph_slam.evaluation.tables import ComparisonTable
+from posegraph_slam.jit import measure_compile_time
+from posegraph_slam.pipeline.clock import StageClock
+from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.run_directory import RECORD, RunDirectory, create_run_directory, require_free
+from posegraph_slam.pipeline.run_record import run_record
+from posegraph_slam.sensors import RobotLog
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOutcome:
+    """What a run gave: its folder, its metrics and record, and remarks for people."""
+
+    folder: Path
+    metrics: Mapping[str, Any]
+    record: Mapping[str, Any]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSummary(RunOutcome):
+    """The outcome of a run that compares trajectories: of its stages, or with odometry."""
+
+    table: ComparisonTable
+
+
+@dataclass(slots=True, kw_only=True)
+class RunUnderWay:
+    """A run that is going on: the log it reads, where it writes, and its clock.
+
+    `inputs` are further entries of its record, which is complete once the block of `recorded_run` has ended.
+    """
+
+    log: RobotLog
+    directory: RunDirectory
+    clock: StageClock
+    inputs: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+
+
+@contextmanager
+def recorded_run(
+    log_path: Path,
+    configuration: Configuration,
+    *,
+    out: Path,
+    overwrite: bool = False,
+    log_format: str | None = None,
+    command: Sequence[str] | None = None,
+) -> Iterator[RunUnderWay]:
+    """Read the log at `log_path`, yield the run to be done with it, and record how it went.
+
+    The run directory `out` appears when the block has ended and all is written; an error leaves nothing. Raises
+    InputError where `out` is taken or the log cannot be read.
+    """
+    require_free(out, overwrite=overwrite)
+    clock = StageClock()
+    with create_run_directory(out, overwrite=overwrite) as directory:
+        with measure_compile_time() as compiling:
+            with clock.stage("reading"):
+                log = read(log_path, format=log_format)
+            run = RunUnderWay(log=log, directory=directory, clock=clock)
+            yield run
+        directory.write_configuration(configuration)
+        written = run_record(
+            configuration,
+            log_path,
+            log_format=log.format,
+            stages_s=clock.seconds,
+            jit_compile_s=compiling.seconds,
+            command=command,
+        )
+        run.record = {**written, **run.inputs}
+        directory.write_json(RECORD, run.record)
