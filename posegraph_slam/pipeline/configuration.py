@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
@@ -83,7 +84,7 @@ def find_configuration(name: str | Path) -> Path:
 
 
 def load_configuration(
-    files: Sequence[str | Path] = (),
+    files: Sequence[str | Path | Mapping[str, Any]] = (),
     overrides: Sequence[str] = (),
     *,
     seed: int | None = None,
@@ -91,9 +92,13 @@ def load_configuration(
 ) -> Configuration:
     """Build the configuration from presets or TOML `files` in order, then `a.b=value` overrides, over the defaults.
 
-    `seed` and `workers`, where given, win over all of them. Raises ConfigurationError naming file and key.
+    A mapping among the files gives its keys, dotted or nested, as a file would; `seed` and `workers`, where given, win
+    over all of them. Raises ConfigurationError naming file and key.
     """
-    layers = [read_layer(find_configuration(name)) for name in files]
+    layers = [
+        Layer(source="config", values=name) if isinstance(name, Mapping) else read_layer(find_configuration(name))
+        for name in files
+    ]
     layers += [parse_override(text) for text in overrides]
     if seed is not None:
         layers.append(Layer(source="--seed", values={"seed": seed}))

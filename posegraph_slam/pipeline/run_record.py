@@ -64,8 +64,10 @@ def _version(name: str) -> str | None:
 def fingerprint(path: Path) -> dict[str, Any]:
     """Return path, number of files, size in bytes and SHA-256 of a file, or of a folder's files with their names.
 
-    The hash is None for inputs of more than `HASHED_BYTES`.
+    The hash is None for inputs of more than `HASHED_BYTES`; a path that is gone, or never was, has no files.
     """
+    if not path.exists():
+        return {"path": str(path), "files": 0, "bytes": 0, "sha256": None}
     files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())
     size = sum(item.stat().st_size for item in files)
     digest = hashlib.sha256()
