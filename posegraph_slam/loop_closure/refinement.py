@@ -12,6 +12,7 @@ from posegraph_slam.geometry import wrap_angle, xyt_from_pose
 from posegraph_slam.loop_closure.matching import constraints_of, register_candidates
 from posegraph_slam.loop_closure.proposals import Candidates
 from posegraph_slam.loop_closure.settings import VerificationSettings
+from posegraph_slam.loop_closure.transients import without_transients
 from posegraph_slam.loop_closure.verification import chi2_gate, passing, rejection_reasons
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
 from posegraph_slam.pose_graph.residuals import chi2, constraint_residuals
@@ -39,6 +40,9 @@ class RefinementSettings(Settings):
     """Keyframes further apart are not matched,"""
     turn_max_rad: float = Field(default=1.6, gt=0)
     """nor those that look further apart than this."""
+    seen_through_min: int = Field(default=2, ge=0)
+    """Points that at least so many other keyframes look through, and more than confirm them, are left out of these
+    matches: people, doors, glass. 0 keeps all."""
     moved_max_m: float = Field(default=0.2, gt=0)
     """A match that moves a pair further has slipped along a wall: the graph is already right to centimetres."""
     covariance_floor_m: float = Field(default=0.01, gt=0)
@@ -69,7 +73,10 @@ def refine_overlaps(
     for round_ in range(settings.rounds):
         progress("refinement", round_, settings.rounds)
         candidates = overlapping_pairs(graph, settings)
-        evidence = register_candidates(candidates, scans, graph.poses @ scans.T_base_lidar, single, executor)
+        lasting = scans
+        if settings.seen_through_min:
+            lasting = without_transients(graph, scans, candidates, settings.seen_through_min, executor)
+        evidence = register_candidates(candidates, lasting, graph.poses @ scans.T_base_lidar, single, executor)
         found = constraints_of(candidates, evidence, scans, settings.covariance_floor_m, settings.covariance_floor_rad)
         moved = constraint_residuals(graph.with_constraints(found))
         near = np.hypot(moved[:, 0], moved[:, 1]) <= settings.moved_max_m

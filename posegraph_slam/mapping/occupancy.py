@@ -90,12 +90,14 @@ def build_occupancy(
     settings: OccupancySettings | None = None,
     *,
     weights: FloatArray | None = None,
+    motion: FloatArray | None = None,
     progress: Progress = silent_progress,
 ) -> OccupancyGrid:
     """Return the occupancy grid of `scans` (N) seen from `trajectory`: T_map_base of every scan, in the same order.
 
     Scans are taken in recorded order, which matters where log-odds reach the clamp. `weights` (N,) >= 0 scales the
-    evidence of each scan; a scan of weight 0 is left out. Spatial poses and tilted sensors are projected onto the
+    evidence of each scan; a scan of weight 0 is left out. `motion` (N, 3) is the motion [x, y, theta] of the lidar
+    during the sweep of each scan, none by default. Spatial poses and tilted sensors are projected onto the
     xy-plane. Raises InputError where the counts differ, poses are not finite or no beam is trusted.
     """
     settings = settings or OccupancySettings()
@@ -105,14 +107,17 @@ def build_occupancy(
     angles = scans.angles_rad[:: settings.beam_stride]
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     limits = _limits(settings, scans)
+    moved = np.zeros((len(scans), 3)) if motion is None else motion
     used = steps.any(axis=1)
-    geometry = _geometry(settings, beam_bounds(ranges[used], T_map_lidar[used], directions, limits))
+    geometry = _geometry(settings, beam_bounds(ranges[used], T_map_lidar[used], moved[used], directions, limits))
     T_cells_lidar = geometry.cells_from_map @ T_map_lidar
     evidence, stamps = np.full(geometry.shape, NEVER_SEEN), np.zeros(geometry.shape, dtype=np.uint8)
     check_ray_length(max(limits.free, limits.no_return) / settings.resolution_m)
     for start, stop in split_range(len(scans), SCANS_A_CHUNK):
         part = slice(start, stop)
-        add_scans(ranges[part], T_cells_lidar[part], directions, limits, steps[part], clamp, evidence, stamps)
+        add_scans(
+            ranges[part], T_cells_lidar[part], moved[part], directions, limits, steps[part], clamp, evidence, stamps
+        )
         progress("occupancy map", stop, len(scans))
     observed = evidence != NEVER_SEEN
     return OccupancyGrid(

@@ -76,6 +76,16 @@ def fixed_point(M: FloatArray, x: float, y: float, out: IntArray) -> None:
 
 
 @kernel
+def beam_end(length: float, direction: FloatArray, part: float, motion: FloatArray) -> tuple[float, float]:
+    """Return where a beam ends, in the lidar frame amid its sweep, during which the lidar moves by `motion` (3,).
+
+    The beam is measured when `part` of the sweep, from -1/2 to 1/2, has passed since its middle.
+    """
+    x, y = length * direction[0], length * direction[1]
+    return x + part * (motion[0] - motion[2] * y), y + part * (motion[1] + motion[2] * x)
+
+
+@kernel
 def plan_walk(start: IntArray, end: IntArray, pitch: int) -> Walk:
     """Prepare the walk over every cell whose interior the segment from `start` to `end` crosses, both ends included.
 
@@ -117,24 +127,27 @@ def index_in_grid(packed: int, rows: int, columns: int) -> int:
 
 @kernel
 def beam_bounds(
-    ranges_m: Float32Array, T_map_lidar: FloatArray, directions: FloatArray, limits: BeamLimits
+    ranges_m: Float32Array, T_map_lidar: FloatArray, motion: FloatArray, directions: FloatArray, limits: BeamLimits
 ) -> FloatArray:
     """Return the bounding box (2, 2) [low, high] of what the beams mark and free, sensor positions included.
 
-    `ranges_m` (N, B), planar sensor poses (N, 3, 3), unit directions (B, 2) in the lidar frame. Infinite without any.
+    `ranges_m` (N, B), planar sensor poses (N, 3, 3), `motion` (N, 3) of the lidar during a sweep, unit directions
+    (B, 2) in the lidar frame. Infinite without any.
     """
+    beams = ranges_m.shape[1]
     box = np.empty((2, 2))
     box[0], box[1] = np.inf, -np.inf
     for scan in range(ranges_m.shape[0]):
         M = T_map_lidar[scan]
-        for beam in range(ranges_m.shape[1]):
+        for beam in range(beams):
             hit, free = reach(ranges_m[scan, beam], limits)
             length = ranges_m[scan, beam] if hit else free
             if length <= 0.0:
                 continue
+            x, y = beam_end(length, directions[beam], (beam + 0.5) / beams - 0.5, motion[scan])
             for axis in range(2):
                 here = M[axis, 2]
-                end = here + length * (M[axis, 0] * directions[beam, 0] + M[axis, 1] * directions[beam, 1])
+                end = here + M[axis, 0] * x + M[axis, 1] * y
                 box[0, axis] = min(box[0, axis], here, end)
                 box[1, axis] = max(box[1, axis], here, end)
     return box
@@ -151,6 +164,7 @@ def changed(evidence: int, step: int, clamp: int) -> int:
 def add_scans(
     ranges_m: Float32Array,
     T_cells_lidar: FloatArray,
+    motion: FloatArray,
     directions: FloatArray,
     limits: BeamLimits,
     steps: IntArray,
@@ -160,11 +174,13 @@ def add_scans(
 ) -> None:
     """Add the evidence of scans (N, B), in order, to `evidence` (R, C), which stays within [-clamp, clamp].
 
-    `T_cells_lidar` (N, 3, 3) maps the lidar frame to cells; `steps` (N, 2) is what a hit adds and a miss takes away.
+    `T_cells_lidar` (N, 3, 3) maps the lidar frame to cells; `motion` (N, 3) as in `beam_end`; `steps` (N, 2) is what a
+    hit adds and a miss takes away.
     A cell changes at most once a scan, and a hit wins: the hits of a scan are written first and leave its mark in
     `stamps` (R, C), which is scratch. One byte a cell keeps the marks of a scan in the processor's nearest cache.
     """
     rows, columns = evidence.shape
+    beams = ranges_m.shape[1]
     total, marks = evidence.reshape(rows * columns), stamps.reshape(rows * columns)
     start, end = np.empty(2, dtype=np.int64), np.empty(2, dtype=np.int64)
     mark = 255
@@ -176,21 +192,22 @@ def add_scans(
         M, hit_step, miss_step = T_cells_lidar[scan], steps[scan, 0], steps[scan, 1]
         if hit_step == 0 and miss_step == 0:
             continue
-        for beam in range(ranges_m.shape[1]):
+        for beam in range(beams):
             hit, _ = reach(ranges_m[scan, beam], limits)
             if hit:
-                length = ranges_m[scan, beam]
-                fixed_point(M, length * directions[beam, 0], length * directions[beam, 1], end)
+                x, y = beam_end(ranges_m[scan, beam], directions[beam], (beam + 0.5) / beams - 0.5, motion[scan])
+                fixed_point(M, x, y, end)
                 column, row = end[0] >> FRACTION_BITS, end[1] >> FRACTION_BITS
                 if 0 <= row < rows and 0 <= column < columns and stamps[row, column] != mark:
                     stamps[row, column] = mark
                     evidence[row, column] = changed(evidence[row, column], hit_step, clamp)
         fixed_point(M, 0.0, 0.0, start)
-        for beam in range(ranges_m.shape[1]):
+        for beam in range(beams):
             _, length = reach(ranges_m[scan, beam], limits)
             if length <= 0.0:
                 continue
-            fixed_point(M, length * directions[beam, 0], length * directions[beam, 1], end)
+            x, y = beam_end(length, directions[beam], (beam + 0.5) / beams - 0.5, motion[scan])
+            fixed_point(M, x, y, end)
             low, high_column, high_row = min(start.min(), end.min()), max(start[0], end[0]), max(start[1], end[1])
             within = low >= 0 and high_column < columns * CELL and high_row < rows * CELL
             walk = plan_walk(start, end, columns if within else PACKED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,6 +36,15 @@ class OdometryEstimate:
     def steps(self) -> FloatArray:
         """Motion T_k_k+1 (N-1, 3, 3) between consecutive poses."""
         return SE2.between(self.trajectory.poses[:-1], self.trajectory.poses[1:])
+
+    def part(self, rows: slice) -> OdometryEstimate:
+        """Return consecutive poses (at least one) with the noise between them."""
+        rows = slice(*rows.indices(len(self.trajectory)))
+        return replace(
+            self,
+            trajectory=self.trajectory.select(np.arange(rows.start, rows.stop)),
+            covariance=self.covariance[rows.start : rows.stop - 1],
+        )
 
 
 def step_covariance(distance_m: FloatArray, turn_rad: FloatArray, noise: StepNoise) -> FloatArray:

@@ -67,7 +67,7 @@ class ScanMatchingResult:
     `keyframe_information` (K-1, 3, 3) belongs to the motion from keyframe k to k+1, `scan_information` (N, 3, 3) to
     the pose of each scan in the local map; both in the tangent of the right update in the base frame.
     `matched_fraction` (N,) is the share of a scan's points that found a surface; `searched` holds the scans for which
-    a window was searched.
+    a window was searched. `lag` of the odometry and duration of a `sweep`, both in scan intervals, were corrected.
     """
 
     trajectory: Trajectory
@@ -76,6 +76,8 @@ class ScanMatchingResult:
     scan_information: FloatArray
     matched_fraction: FloatArray
     searched: IntArray
+    lag: float = 0.0
+    sweep: float = 0.0
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

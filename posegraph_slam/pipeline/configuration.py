@@ -20,6 +20,7 @@ from posegraph_slam.mapping.occupancy import OccupancySettings
 from posegraph_slam.mapping.texture import TextureSettings
 from posegraph_slam.odometry.scan_matching import ScanMatchingSettings
 from posegraph_slam.odometry.settings import OdometrySettings
+from posegraph_slam.odometry.timing import TimingSettings
 from posegraph_slam.pipeline.settings_files import Layer, build_settings, parse_override, read_layer
 from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
@@ -36,6 +37,7 @@ class Configuration(Settings):
     """Threads or processes that share the work, 0 for one a core; results do not depend on it."""
     odometry: OdometrySettings = OdometrySettings()
     scans: BeamScanSettings = BeamScanSettings()
+    timing: TimingSettings = TimingSettings()
     scan_matching: ScanMatchingSettings = ScanMatchingSettings()
     loop_closure: LoopClosureSettings = LoopClosureSettings()
     refinement: RefinementSettings = RefinementSettings()

@@ -12,6 +12,7 @@ from posegraph_slam.mapping.archive import npz_bytes, read_npz, replace_file
 from posegraph_slam.odometry.scan_matching import ScanMatchingResult
 
 MATCHING = "scan_matching.npz"
+CLOCKS = ("lag", "sweep")
 ARRAYS = ("keyframes", "keyframe_information", "scan_information", "matched_fraction", "searched")
 
 
@@ -19,12 +20,13 @@ def write_matching(matched: ScanMatchingResult, path: Path) -> None:
     """Write poses, keyframes and their noise exactly."""
     arrays = {name: getattr(matched, name) for name in ARRAYS}
     trajectory = {"stamps_s": matched.trajectory.stamps_s, "poses": matched.trajectory.poses}
-    replace_file(path, npz_bytes({**trajectory, **arrays}))
+    clocks = {name: np.array(getattr(matched, name)) for name in CLOCKS}
+    replace_file(path, npz_bytes({**trajectory, **clocks, **arrays}))
 
 
 def read_matching(path: Path, scans: int) -> ScanMatchingResult:
     """Read the scan matching of a log of `scans` scans; InputError where the file is of another log."""
-    arrays = read_npz(path, ("stamps_s", "poses", *ARRAYS))
+    arrays = read_npz(path, ("stamps_s", "poses", *CLOCKS, *ARRAYS))
     count = len(arrays["stamps_s"])
     if count != scans:
         raise InputError(path, f"holds {count} scans, but the log has {scans}", "give the run directory of this log")
@@ -38,4 +40,6 @@ def read_matching(path: Path, scans: int) -> ScanMatchingResult:
         scan_information=arrays["scan_information"],
         matched_fraction=arrays["matched_fraction"],
         searched=arrays["searched"],
+        lag=float(arrays["lag"]),
+        sweep=float(arrays["sweep"]),
     )

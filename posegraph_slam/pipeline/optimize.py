@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from posegraph_slam.arrays import BoolArray, IntArray
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.errors import InputError
 from posegraph_slam.evaluation.summary import compare, evaluate_trajectory
 from posegraph_slam.evaluation.tables import ComparisonTable
@@ -21,13 +21,15 @@ from posegraph_slam.loop_closure.refinement import refine_overlaps
 from posegraph_slam.mapping.crispness import crispness
 from posegraph_slam.mapping.occupancy import OccupancyGrid, OccupancySettings, build_occupancy
 from posegraph_slam.mapping.texture import TextureMap, build_texture
-from posegraph_slam.odometry.scan_matching import ScanMatchingResult, match_scans
+from posegraph_slam.odometry.scan_matching import ScanMatchingResult
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
 from posegraph_slam.odometry.smoothing import smooth
+from posegraph_slam.odometry.timing import without_lag
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.matching import keyframe_scans, match_log, motion_in_sweep
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
-from posegraph_slam.registration.beam_scans import BeamScans, prepare_beam_scans
+from posegraph_slam.registration.beam_scans import BeamScans
 from posegraph_slam.sensors import LaserScans, RobotLog
 
 STAGES = ("odometry", "scan matching", "optimised")
@@ -91,9 +93,10 @@ def optimize(
     with clock.stage("odometry"):
         odometry = odometry_at_scans(log, configuration.odometry)
     with clock.stage("scan matching"):
-        beams = prepare_beam_scans(scans, configuration.scans, executor)
         if matched is None:
-            matched = match_scans(beams, odometry, configuration.scan_matching, executor=executor, progress=progress)
+            matched = match_log(scans, odometry, configuration, executor=executor, progress=progress)
+        odometry = without_lag(odometry, matched.lag)
+        beams = keyframe_scans(scans, matched, configuration, executor)
     with clock.stage("loop closure"):
         closed = _close(matched, beams, configuration, executor, progress)
     with clock.stage("refinement"):
@@ -103,7 +106,8 @@ def optimize(
             optimised = smooth(optimised, matched.scan_information, odometry)
     stages = dict(zip(STAGES, (odometry.trajectory, matched.trajectory, in_map_frame(optimised)), strict=True))
     with clock.stage("maps"):
-        maps = _maps(scans, stages, configuration, executor, progress)
+        motion = motion_in_sweep(scans, matched.trajectory.poses, matched.sweep, configuration.timing)
+        maps = _maps(scans, stages, motion, configuration, executor, progress)
         texture = _texture(log, stages["optimised"], maps.get("optimised"), configuration, executor, progress)
     with clock.stage("evaluation"):
         measured = {
@@ -142,7 +146,7 @@ def _close(
 ) -> LoopClosureResult:
     return close_loops(
         keyframe_chain(matched),
-        beams.select(matched.keyframes),
+        beams,
         configuration.loop_closure,
         configuration.pose_graph,
         executor=executor,
@@ -163,7 +167,7 @@ def _refine(
         return graph
     return refine_overlaps(
         graph,
-        beams.select(matched.keyframes),
+        beams,
         configuration.refinement,
         configuration.loop_closure.verification,
         configuration.pose_graph,
@@ -175,6 +179,7 @@ def _refine(
 def _maps(
     scans: LaserScans,
     stages: Mapping[str, Trajectory],
+    motion: FloatArray,
     configuration: Configuration,
     executor: Executor,
     progress: Progress,
@@ -182,14 +187,14 @@ def _maps(
     """Build the occupancy map of each stage, so that their crispness can be compared."""
     if not configuration.maps:
         return {}
-    build = partial(_occupancy, scans=scans, settings=configuration.mapping, progress=progress)
+    build = partial(_occupancy, scans=scans, motion=motion, settings=configuration.mapping, progress=progress)
     return dict(zip(stages, executor.map(build, stages.values()), strict=True))
 
 
 def _occupancy(
-    trajectory: Trajectory, *, scans: LaserScans, settings: OccupancySettings, progress: Progress
+    trajectory: Trajectory, *, scans: LaserScans, motion: FloatArray, settings: OccupancySettings, progress: Progress
 ) -> OccupancyGrid:
-    return build_occupancy(scans, trajectory, settings, progress=progress)
+    return build_occupancy(scans, trajectory, settings, motion=motion, progress=progress)
 
 
 def usable_scans(log: RobotLog) -> LaserScans:
@@ -256,6 +261,8 @@ def _summary(scans: LaserScans, matched: ScanMatchingResult, closed: LoopClosure
         "scans": len(scans),
         "keyframes": len(matched.keyframes),
         "scans_searched": len(matched.searched),
+        "odometry_lag_scans": matched.lag,
+        "sweep_scans": matched.sweep,
         "loops_proposed": len(closed.records),
         "loops_accepted": len(accepted),
         "loops_by_kind": {

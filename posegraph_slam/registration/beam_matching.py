@@ -156,6 +156,30 @@ def accumulate(source, ref, pose, gate, robust, min_cosine, points, lines, kind,
 
 
 @kernel
+def nearest_return(x, y, ref, limit2, points, kind, geometry):  # type: ignore[no-untyped-def]
+    """Return the beam of scan `ref` whose return is nearest to (x, y) within the root of `limit2`, -1 for none.
+
+    As in `accumulate`, which holds the same search in its own body.
+    """
+    beams = kind.shape[1]
+    turn = int(np.round(2 * np.pi / geometry[1]))
+    r2 = x * x + y * y
+    centre = int(np.round((np.arctan2(y, x) - geometry[0]) / geometry[1]))
+    best, best_d2 = -1, limit2
+    for offset in range(beams):
+        if r2 * geometry[GEOMETRY_HEAD + offset] > best_d2:
+            break
+        for k in (centre - offset, centre + offset):
+            if beams >= turn:
+                k %= turn
+            if 0 <= k < beams and kind[ref, k] > 0:
+                d2 = (points[ref, k, 0] - x) ** 2 + (points[ref, k, 1] - y) ** 2
+                if d2 < best_d2:
+                    best, best_d2 = k, d2
+    return best
+
+
+@kernel
 def solve3(H, g):  # type: ignore[no-untyped-def]
     """Solve the symmetric positive definite system H d = g whose upper triangle is given."""
     a, b, c = H[0, 0], H[0, 1], H[0, 2]

@@ -95,8 +95,18 @@ class BeamScans:
         )
 
 
-def prepare_beam_scans(scans: LaserScans, settings: BeamScanSettings, executor: Executor | None = None) -> BeamScans:
-    """Turn ranges (N, B) into points with lines, dropping what is no trusted return."""
+def prepare_beam_scans(
+    scans: LaserScans,
+    settings: BeamScanSettings,
+    executor: Executor | None = None,
+    *,
+    motion: FloatArray | None = None,
+) -> BeamScans:
+    """Turn ranges (N, B) into points with lines, dropping what is no trusted return.
+
+    `motion` (N, 3) is the planar motion [x, y, theta] of the lidar during the sweep of each scan: its points are put
+    where they would have been seen from the middle of the sweep. Without it the scans are taken as they are.
+    """
     if scans.angle_increment_rad <= 0:
         raise InputError("laser scans", f"angle increment {scans.angle_increment_rad} rad is not positive")
     lower = max(settings.range_min_m, scans.range_min_m)
@@ -110,7 +120,8 @@ def prepare_beam_scans(scans: LaserScans, settings: BeamScanSettings, executor: 
         surface_sigma=settings.surface_sigma_m,
         spacing=settings.source_spacing_m,
     )
-    chunks = [scans.ranges_m[start:stop] for start, stop in split_range(len(scans), SCANS_A_CHUNK)]
+    moved = np.zeros((len(scans), 3)) if motion is None else motion
+    chunks = [(scans.ranges_m[start:stop], moved[start:stop]) for start, stop in split_range(len(scans), SCANS_A_CHUNK)]
     parts = (executor or SerialExecutor()).map(prepare, chunks)
     points, lines, kind, thinned = (np.concatenate([part[k] for part in parts]) for k in range(4))
     return BeamScans(
@@ -125,14 +136,21 @@ def prepare_beam_scans(scans: LaserScans, settings: BeamScanSettings, executor: 
 
 
 def _prepare_chunk(
-    ranges: Float32Array, cos: FloatArray, sin: FloatArray, limits: FloatArray, surface_sigma: float, spacing: float
+    chunk: tuple[Float32Array, FloatArray],
+    *,
+    cos: FloatArray,
+    sin: FloatArray,
+    limits: FloatArray,
+    surface_sigma: float,
+    spacing: float,
 ) -> tuple[Float32Array, Float32Array, ByteArray, BoolArray]:
-    points, lines, kind, thinned = _prepare(ranges, cos, sin, limits, surface_sigma, spacing)
+    ranges, motion = chunk
+    points, lines, kind, thinned = _prepare(ranges, motion, cos, sin, limits, surface_sigma, spacing)
     return points, lines, kind, thinned
 
 
 @kernel
-def _prepare(ranges, cos, sin, limits, surface_sigma, spacing):  # type: ignore[no-untyped-def]
+def _prepare(ranges, motion, cos, sin, limits, surface_sigma, spacing):  # type: ignore[no-untyped-def]
     count, beams = ranges.shape
     points = np.zeros((count, beams, 2), np.float32)
     lines = np.zeros((count, beams, 3), np.float32)
@@ -143,8 +161,10 @@ def _prepare(ranges, cos, sin, limits, surface_sigma, spacing):  # type: ignore[
         for b in range(beams):
             r = ranges[s, b]
             if r >= limits[0] and r < limits[1]:
-                points[s, b, 0] = r * cos[b]
-                points[s, b, 1] = r * sin[b]
+                # to first order: a sweep turns by a few hundredths of a radian
+                part = (b + 0.5) / beams - 0.5
+                points[s, b, 0] = r * cos[b] + part * (motion[s, 0] - motion[s, 2] * r * sin[b])
+                points[s, b, 1] = r * sin[b] + part * (motion[s, 1] + motion[s, 2] * r * cos[b])
                 kind[s, b] = 1
         _fit_lines(points[s], kind[s], lines[s], limits[2], limits[3], surface_sigma)
         _thin(points[s], lines[s], kind[s], thinned[s], cos, sin, increment, spacing)
