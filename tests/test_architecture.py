@@ -33,7 +33,13 @@ HOMES = {
     "matplotlib": ("report/",),
     "dask": ("pipeline/",),
     "distributed": ("pipeline/",),
-    "cv2": ("datasets/simulation/files.py", "localization/free_space.py", "mapping/images.py"),
+    "rosbags": ("datasets/rosbag/",),
+    "cv2": (
+        "datasets/rosbag/images.py",
+        "datasets/simulation/files.py",
+        "localization/free_space.py",
+        "mapping/images.py",
+    ),
     "open3d": (),
     "evo": (),  # GPL: an oracle in the tests, never a part of the package
     "small_gicp": (),

@@ -115,7 +115,7 @@ def stream_stamps(log: RobotLog) -> dict[str, FloatArray]:
     stamps = {name: stream.stamps_s for name, stream in streams.items() if stream is not None}
     if log.rgbd is not None:
         stamps |= {"disparity": log.rgbd.disparity_stamps_s, "colour": log.rgbd.colour_stamps_s}
-    return stamps
+    return stamps | {f"images {camera.name}": camera.stamps_s for camera in log.images}
 
 
 def _files(files: tuple[Path | None, ...]) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -28,7 +28,8 @@ class Reader:
     """One format: what it is, how to recognise it cheaply, and how to read it.
 
     `detects(path)` looks at names and first bytes only and never raises; `read(path)` returns a `RobotLog` or raises
-    `InputError` naming the file. `layout` describes for people what the path has to be.
+    `InputError` naming the file. `layout` describes for people what the path has to be. A format whose streams have
+    names that can be chosen has `read_topics(path, topics)` too, where `topics` maps roles to names.
     """
 
     name: str
@@ -36,9 +37,10 @@ class Reader:
     layout: str
     detects: Callable[[Path], bool]
     read: Callable[[Path], RobotLog]
+    read_topics: Callable[[Path, Mapping[str, str]], RobotLog] | None = None
 
 
-def _built_in(name: str, description: str, layout: str) -> Reader:
+def _built_in(name: str, description: str, layout: str, *, topics: bool = False) -> Reader:
     """Describe the reader in `posegraph_slam.datasets.<name>`, whose module is imported at the first call."""
     module = f"posegraph_slam.datasets.{name}"
 
@@ -49,7 +51,18 @@ def _built_in(name: str, description: str, layout: str) -> Reader:
         log: RobotLog = importlib.import_module(module).read(path)
         return log
 
-    return Reader(name=name, description=description, layout=layout, detects=detects, read=read_log)
+    def read_topics(path: Path, topics: Mapping[str, str]) -> RobotLog:
+        log: RobotLog = importlib.import_module(module).read(path, topics)
+        return log
+
+    return Reader(
+        name=name,
+        description=description,
+        layout=layout,
+        detects=detects,
+        read=read_log,
+        read_topics=read_topics if topics else None,
+    )
 
 
 BUILT_IN = (
@@ -62,6 +75,12 @@ BUILT_IN = (
         "carmen",
         "laser log of the CARMEN robot navigation toolkit (FLASER, RLASER, ROBOTLASER1, ODOM, PARAM)",
         "a text file .clf, .log or .txt, or one of them compressed as .gz",
+    ),
+    _built_in(
+        "rosbag",
+        "bag of ROS 1 or ROS 2: laser scans or point clouds, odometry, IMU, images and frames (TF)",
+        "a file .bag (ROS 1), .mcap or .db3 (ROS 2), or the folder of a ROS 2 bag with its metadata.yaml",
+        topics=True,
     ),
     _built_in(
         "humanoid",
@@ -98,11 +117,17 @@ def available_readers() -> tuple[Reader, ...]:
     return tuple(readers.values())
 
 
-def read(path: str | Path, *, format: str | None = None) -> RobotLog:  # noqa: A002 - the word users know
+def read(
+    path: str | Path,
+    *,
+    format: str | None = None,  # noqa: A002 - the word users know
+    topics: Mapping[str, str] | None = None,
+) -> RobotLog:
     """Read the log at `path` with the reader called `format`, or with the first one that recognises it.
 
-    Raises `InputError` when the path does not exist, the format is unknown, no reader recognises the path, or the
-    reader finds the content unusable.
+    `topics` maps roles (scan, odom, imu, ...) to the topics of a bag, where the likeliest ones are not meant. Raises
+    `InputError` when the path does not exist, the format is unknown, no reader recognises the path, or the reader
+    finds the content unusable.
     """
     path = Path(path)
     if not path.exists():
@@ -111,7 +136,11 @@ def read(path: str | Path, *, format: str | None = None) -> RobotLog:  # noqa: A
         raise InputError(path, "the folder is empty", "give a folder or file that holds a log")
     readers = available_readers()
     reader = _choose(path, readers) if format is None else _named(format, readers)
-    return reader.read(path)
+    if not topics:
+        return reader.read(path)
+    if reader.read_topics is None:
+        raise InputError("--topic", f"a {reader.name} log has no topics to choose", "leave the option out")
+    return reader.read_topics(path, topics)
 
 
 def _named(name: str, readers: tuple[Reader, ...]) -> Reader:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from posegraph_slam.geometry import Relations, Trajectory
+from posegraph_slam.sensors.images import ImageStream
 from posegraph_slam.sensors.imu import Imu
 from posegraph_slam.sensors.laser import LaserScans
 from posegraph_slam.sensors.rgbd import RgbdFrames
@@ -17,7 +18,8 @@ class RobotLog:
     """The streams of a log, each None where the robot did not record it, and the truth where it is known.
 
     `scan_odometry` is the logged odometry pose T_odom_base of every scan (same order and count as `scans`);
-    `odometry` the logger's separate odometry stream. `remarks` are plain sentences on what the reader had to do.
+    `odometry` the logger's separate odometry stream; `images` are cameras whose images stay where they were recorded.
+    `remarks` are plain sentences on what the reader had to do.
     """
 
     path: Path
@@ -28,6 +30,7 @@ class RobotLog:
     odometry: Trajectory | None = None
     scan_odometry: Trajectory | None = None
     rgbd: RgbdFrames | None = None
+    images: tuple[ImageStream, ...] = ()
     truth: Trajectory | None = None
     relations: Relations | None = None
     remarks: tuple[str, ...] = field(default=())
