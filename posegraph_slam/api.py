@@ -103,12 +103,18 @@ class Run:
         return Path(folder)
 
 
-def read(path: str | Path, *, format: str | None = None) -> RobotLog:  # noqa: A002 - the word users know
+def read(
+    path: str | Path,
+    *,
+    format: str | None = None,  # noqa: A002 - the word users know
+    topics: Mapping[str, str] | None = None,
+) -> RobotLog:
     """Read a log with the reader that recognises it, or with the one called `format` (`psg datasets` lists them).
 
-    Raises InputError naming the file and what is wrong with it.
+    `topics` chooses those of a bag, such as `{"scan": "/front/scan"}`, where the guessed ones are not meant. Raises
+    InputError naming the file and what is wrong with it.
     """
-    return read_log(path, format=format)
+    return read_log(path, format=format, topics=topics)
 
 
 def optimize(

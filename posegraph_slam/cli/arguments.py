@@ -11,6 +11,12 @@ Log = Annotated[
     Path, typer.Argument(metavar="LOG", help="File or folder of the log; `psg datasets` lists the formats.")
 ]
 Format = Annotated[str | None, typer.Option("--format", help="Reader to use instead of the one that recognises LOG.")]
+Topic = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic", metavar="ROLE=NAME", help="Topic of a bag for scan, odom, imu, image or truth; repeatable."
+    ),
+]
 Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set one configuration key, as section.key=value; repeatable."),
@@ -25,3 +31,10 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")
 Out = Annotated[Path, typer.Option("--out", "-o", help="Run directory.")]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print remarks and the time of each stage too.")]
+
+
+def topic_names(options: list[str] | None) -> dict[str, str]:
+    """Return the roles and topics that --topic options name; InputError for a role that does not exist."""
+    from posegraph_slam.datasets.rosbag.topics import parse_topics
+
+    return parse_topics(options or [])

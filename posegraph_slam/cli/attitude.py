@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from posegraph_slam.cli.arguments import Format, Json, Overwrite, Quiet
+from posegraph_slam.cli.arguments import Format, Json, Overwrite, Quiet, Topic, topic_names
 from posegraph_slam.cli.console import print_json, print_note, print_table
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def attitude(
         Path | None, typer.Option("--figure", metavar="FILE.png", help="Draw estimate and truth.")
     ] = None,
     log_format: Format = None,
+    topic: Topic = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -47,7 +48,7 @@ def attitude(
     from posegraph_slam.odometry.attitude import estimate_attitude
 
     refuse_existing(out, figure, overwrite=overwrite)
-    log = read(run, format=log_format)
+    log = read(run, format=log_format, topics=topic_names(topic))
     if log.imu is None:
         raise InputError(run, "holds no IMU", "give a log with gyro and accelerometer")
     estimates = {name: estimate_attitude(log.imu, method=name.value) for name in Method}

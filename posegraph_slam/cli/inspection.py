@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Set
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Set, Topic, topic_names
 from posegraph_slam.cli.console import print_json, print_table, print_warning
 
 if TYPE_CHECKING:
@@ -14,7 +14,12 @@ if TYPE_CHECKING:
 
 
 def inspect(
-    log: Log, log_format: Format = None, config: Config = None, settings: Set = None, as_json: Json = False
+    log: Log,
+    log_format: Format = None,
+    topic: Topic = None,
+    config: Config = None,
+    settings: Set = None,
+    as_json: Json = False,
 ) -> None:
     """Show the streams of a log, what is suspicious in it, and what `psg optimize` would do with it."""
     from posegraph_slam.datasets import read
@@ -23,7 +28,7 @@ def inspect(
     from posegraph_slam.pipeline.plan import describe
 
     configuration = load_configuration(config or [], settings or [])
-    robot_log = read(log, format=log_format)
+    robot_log = read(log, format=log_format, topics=topic_names(topic))
     inspection = inspect_log(robot_log)
     plan = describe(robot_log, configuration)
     if as_json:

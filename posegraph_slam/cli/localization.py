@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set, Topic, topic_names
 from posegraph_slam.cli.console import ProgressBars
 from posegraph_slam.cli.runs import report
 
@@ -29,6 +29,7 @@ def localize(
     config: Config = None,
     settings: Set = None,
     log_format: Format = None,
+    topic: Topic = None,
     seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -48,6 +49,7 @@ def localize(
             start=None if start is None else parse_pose(start),
             overwrite=overwrite,
             log_format=log_format,
+            topics=topic_names(topic),
             progress=progress,
         )
     report(summary, show, quiet=quiet, as_json=as_json)

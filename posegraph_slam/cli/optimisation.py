@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Overwrite, Quiet, Seed, Set, Verbose
+from posegraph_slam.cli.arguments import (
+    Config,
+    Format,
+    Json,
+    Log,
+    Overwrite,
+    Quiet,
+    Seed,
+    Set,
+    Topic,
+    Verbose,
+    topic_names,
+)
 from posegraph_slam.cli.console import ProgressBars, print_table
 from posegraph_slam.cli.runs import report
 
@@ -23,6 +35,7 @@ def optimize(
     settings: Set = None,
     truth: Annotated[Path | None, typer.Option("--truth", help="TUM file of true poses to compare with.")] = None,
     log_format: Format = None,
+    topic: Topic = None,
     seed: Seed = None,
     workers: Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")] = None,
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Close no loops: scan matching alone.")] = False,
@@ -54,6 +67,7 @@ def optimize(
             out=out or default_out(plan.log if start is None else log.with_name(f"{log.resolve().name}-{start}")),
             overwrite=overwrite,
             log_format=log_format or plan.log_format,
+            topics={**(plan.topics or {}), **topic_names(topic)},
             truth=truth,
             matching_of=plan.matching_of,
             draw=draw_figures,

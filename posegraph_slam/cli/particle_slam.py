@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set, Topic, topic_names
 from posegraph_slam.cli.console import ProgressBars, print_table
 from posegraph_slam.cli.runs import report
 
@@ -18,6 +18,7 @@ def pf_slam(
     config: Config = None,
     settings: Set = None,
     log_format: Format = None,
+    topic: Topic = None,
     seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -30,7 +31,13 @@ def pf_slam(
     configuration = load_configuration(config or [], settings or [], seed=seed)
     with ProgressBars(enabled=not quiet) as progress:
         summary = run_particle_slam(
-            log, configuration, out=out, overwrite=overwrite, log_format=log_format, progress=progress
+            log,
+            configuration,
+            out=out,
+            overwrite=overwrite,
+            log_format=log_format,
+            topics=topic_names(topic),
+            progress=progress,
         )
     report(summary, show, quiet=quiet, as_json=as_json)
 

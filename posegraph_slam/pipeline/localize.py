@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ def run_localization(
     start: FloatArray | None = None,
     overwrite: bool = False,
     log_format: str | None = None,
+    topics: Mapping[str, str] | None = None,
     progress: Progress = silent_progress,
     command: Sequence[str] | None = None,
 ) -> RunOutcome:
@@ -76,7 +77,13 @@ def run_localization(
     Raises InputError where `out` is taken, or map or log cannot be used; nothing is then left.
     """
     with recorded_run(
-        log_path, configuration, out=out, overwrite=overwrite, log_format=log_format, command=command
+        log_path,
+        configuration,
+        out=out,
+        overwrite=overwrite,
+        log_format=log_format,
+        topics=topics,
+        command=command,
     ) as run:
         with run.clock.stage("reading"):
             grid = read_nav2(map_path)

@@ -29,6 +29,7 @@ def run_particle_slam(
     out: Path,
     overwrite: bool = False,
     log_format: str | None = None,
+    topics: Mapping[str, str] | None = None,
     progress: Progress = silent_progress,
     command: Sequence[str] | None = None,
 ) -> RunSummary:
@@ -37,7 +38,13 @@ def run_particle_slam(
     Raises InputError where `out` is taken or the log cannot be used; nothing is then left.
     """
     with recorded_run(
-        log_path, configuration, out=out, overwrite=overwrite, log_format=log_format, command=command
+        log_path,
+        configuration,
+        out=out,
+        overwrite=overwrite,
+        log_format=log_format,
+        topics=topics,
+        command=command,
     ) as run:
         scans = usable_scans(run.log)
         with run.clock.stage("odometry"):

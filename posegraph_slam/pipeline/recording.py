@@ -57,6 +57,7 @@ def recorded_run(
     out: Path,
     overwrite: bool = False,
     log_format: str | None = None,
+    topics: Mapping[str, str] | None = None,
     command: Sequence[str] | None = None,
 ) -> Iterator[RunUnderWay]:
     """Read the log at `log_path`, yield the run to be done with it, and record how it went.
@@ -69,7 +70,7 @@ def recorded_run(
     with create_run_directory(out, overwrite=overwrite) as directory:
         with measure_compile_time() as compiling:
             with clock.stage("reading"):
-                log = read(log_path, format=log_format)
+                log = read(log_path, format=log_format, topics=topics)
             run = RunUnderWay(log=log, directory=directory, clock=clock)
             yield run
         directory.write_configuration(configuration)
@@ -77,6 +78,7 @@ def recorded_run(
             configuration,
             log_path,
             log_format=log.format,
+            topics=topics,
             stages_s=clock.seconds,
             jit_compile_s=compiling.seconds,
             command=command,

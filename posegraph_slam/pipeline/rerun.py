@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +28,7 @@ class RunPlan:
     log: Path
     configuration: Configuration
     log_format: str | None = None
+    topics: Mapping[str, str] | None = None
     matching_of: Path | None = None
 
 
@@ -61,6 +62,7 @@ def plan_run(
         log=source,
         configuration=load_configuration([log / CONFIGURATION, *files], overrides, seed=seed, workers=workers),
         log_format=run.record["input"]["format"],
+        topics=run.record["input"].get("topics"),
         matching_of=log if start == "graph" else None,
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from posegraph_slam.datasets.tum import read_tum
@@ -29,6 +29,7 @@ def run(
     out: Path,
     overwrite: bool = False,
     log_format: str | None = None,
+    topics: Mapping[str, str] | None = None,
     truth: Path | None = None,
     matching_of: Path | None = None,
     draw: Draw | None = None,
@@ -42,7 +43,13 @@ def run(
     error leaves nothing. Raises InputError where `out` is taken or the log cannot be used.
     """
     with recorded_run(
-        log_path, configuration, out=out, overwrite=overwrite, log_format=log_format, command=command
+        log_path,
+        configuration,
+        out=out,
+        overwrite=overwrite,
+        log_format=log_format,
+        topics=topics,
+        command=command,
     ) as under_way:
         log, clock = under_way.log, under_way.clock
         matched = None

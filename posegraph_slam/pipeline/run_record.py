@@ -6,7 +6,7 @@ import hashlib
 import platform
 import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ def run_record(
     log: Path,
     *,
     log_format: str,
+    topics: Mapping[str, str] | None = None,
     stages_s: dict[str, float],
     jit_compile_s: float,
     command: Sequence[str] | None = None,
@@ -41,7 +42,7 @@ def run_record(
         "command": list(sys.argv if command is None else command),
         "configuration_sha256": configuration_hash(configuration),
         "seed": configuration.seed,
-        "input": {"format": log_format, **fingerprint(log)},
+        "input": {"format": log_format, **({"topics": dict(topics)} if topics else {}), **fingerprint(log)},
         "stages_s": {name: round(seconds, 3) for name, seconds in stages_s.items()},
         "total_s": round(sum(stages_s.values()), 3),
         "jit_compile_s": round(jit_compile_s, 3),

@@ -12,6 +12,8 @@ import pytest
 
 from posegraph_slam.datasets.simulation.humanoid import write_humanoid_log
 
+from .bag_writing import maker_of, robot, store_as
+
 EPOCH_S = 1298445274.5
 
 
@@ -113,6 +115,7 @@ def build(name: str, folder: Path) -> Path:
         "ece276a": lambda: write_ece276a(folder / "run"),
         "carmen": lambda: write_carmen(folder / "log.clf"),
         "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
+        "rosbag": lambda: store_as("ros1", folder, robot(maker_of("ros1"))),
         "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
     }[name]()
 
@@ -124,6 +127,7 @@ def build_truncated(name: str, folder: Path) -> tuple[Path, Path]:
         "ece276a": lambda: write_ece276a(folder / "run"),
         "carmen": lambda: write_carmen(folder / "log.clf.gz"),
         "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
+        "rosbag": lambda: store_as("ros1", folder, robot(maker_of("ros1"))),
         "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
     }[name]()
     file = path / "Hokuyo7.npz" if path.is_dir() else path
