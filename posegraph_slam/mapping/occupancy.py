@@ -120,9 +120,10 @@ def build_occupancy(
         )
         progress("occupancy map", stop, len(scans))
     observed = evidence != NEVER_SEEN
-    return OccupancyGrid(
-        geometry=geometry, log_odds=np.where(observed, evidence, 0) * np.float32(unit), observed=observed
-    )
+    evidence[~observed] = 0
+    log_odds = evidence.astype(np.float32)
+    log_odds *= np.float32(unit)
+    return OccupancyGrid(geometry=geometry, log_odds=log_odds, observed=observed)
 
 
 def _log_odds(probability: float) -> float:

@@ -95,7 +95,7 @@ def optimize(
     with clock.stage("scan matching"):
         if matched is None:
             matched = match_log(scans, odometry, configuration, executor=executor, progress=progress)
-        odometry = without_lag(odometry, matched.lag)
+        in_time = without_lag(odometry, matched.lag)
         beams = keyframe_scans(scans, matched, configuration, executor)
     with clock.stage("loop closure"):
         closed = _close(matched, beams, configuration, executor, progress)
@@ -103,19 +103,19 @@ def optimize(
         graph = _refine(closed.graph, matched, beams, configuration, executor, progress)
         optimised = deform(matched.trajectory, matched.keyframes, graph.poses)
         if configuration.smoothing and odometry.source in ("wheels", "wheels_imu"):
-            optimised = smooth(optimised, matched.scan_information, odometry)
+            optimised = smooth(optimised, matched.scan_information, in_time)
     stages = dict(zip(STAGES, (odometry.trajectory, matched.trajectory, in_map_frame(optimised)), strict=True))
     with clock.stage("maps"):
         motion = motion_in_sweep(scans, matched.trajectory.poses, matched.sweep, configuration.timing)
-        maps = _maps(scans, stages, motion, configuration, executor, progress)
-        texture = _texture(log, stages["optimised"], maps.get("optimised"), configuration, executor, progress)
+        occupancy, crisp = _maps(scans, stages, motion, matched.keyframes, configuration, executor, progress)
+        texture = _texture(log, stages["optimised"], occupancy, configuration, executor, progress)
     with clock.stage("evaluation"):
         measured = {
             name: evaluate_trajectory(
                 trajectory,
                 truth=log.truth,
                 relations=log.relations,
-                crispness=crispness(maps[name]) if name in maps else None,
+                crispness=crisp.get(name),
             )
             for name, trajectory in stages.items()
         }
@@ -124,7 +124,7 @@ def optimize(
         matched=matched,
         graph=graph,
         loops=closed.records,
-        occupancy=maps.get("optimised"),
+        occupancy=occupancy,
         texture=texture,
         comparison=compare(measured),
         metrics={
@@ -180,21 +180,42 @@ def _maps(
     scans: LaserScans,
     stages: Mapping[str, Trajectory],
     motion: FloatArray,
+    keyframes: IntArray,
     configuration: Configuration,
     executor: Executor,
     progress: Progress,
-) -> dict[str, OccupancyGrid]:
-    """Build the occupancy map of each stage, so that their crispness can be compared."""
+) -> tuple[OccupancyGrid | None, dict[str, float]]:
+    """Build the occupancy map of all scans, and those of the keyframes at each stage for their crispness alone."""
     if not configuration.maps:
-        return {}
-    build = partial(_occupancy, scans=scans, motion=motion, settings=configuration.mapping, progress=progress)
-    return dict(zip(stages, executor.map(build, stages.values()), strict=True))
+        return None, {}
+    final = _MapWork(trajectory=stages["optimised"], index=np.arange(len(scans)), keep=True)
+    compared = [_MapWork(trajectory=trajectory, index=keyframes, keep=False) for trajectory in stages.values()]
+    build = partial(_build_map, scans=scans, motion=motion, settings=configuration.mapping, progress=progress)
+    (occupancy, _), *measured = executor.map(build, [final, *compared])
+    return occupancy, dict(zip(stages, (figure for _, figure in measured), strict=True))
 
 
-def _occupancy(
-    trajectory: Trajectory, *, scans: LaserScans, motion: FloatArray, settings: OccupancySettings, progress: Progress
-) -> OccupancyGrid:
-    return build_occupancy(scans, trajectory, settings, motion=motion, progress=progress)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _MapWork:
+    """A map to be built from the scans at `index`; only its crispness is wanted where it is not to be kept."""
+
+    trajectory: Trajectory
+    index: IntArray
+    keep: bool
+
+
+def _build_map(
+    work: _MapWork, *, scans: LaserScans, motion: FloatArray, settings: OccupancySettings, progress: Progress
+) -> tuple[OccupancyGrid | None, float]:
+    index = work.index
+    grid = build_occupancy(
+        scans if work.keep else scans.select(index),
+        work.trajectory.select(index),
+        settings,
+        motion=motion[index],
+        progress=progress if work.keep else silent_progress,
+    )
+    return (grid, 0.0) if work.keep else (None, crispness(grid))
 
 
 def usable_scans(log: RobotLog) -> LaserScans:

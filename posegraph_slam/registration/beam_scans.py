@@ -173,48 +173,56 @@ def _prepare(ranges, motion, cos, sin, limits, surface_sigma, spacing):  # type:
 
 @kernel
 def _fit_lines(points, kind, lines, radius_min, gap_max, surface_sigma):  # type: ignore[no-untyped-def]
-    """Fit a line to the beams around each point that lie on its surface."""
+    """Fit a line to the beams around each point that lie on its surface.
+
+    Neighbours are found beam by beam; their sums come from running sums over the scan, so that the cost of a
+    neighbour is one distance.
+    """
     beams = len(kind)
+    px, py = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
+    sums = np.zeros((beams + 1, 5))
+    for b in range(beams):
+        sums[b + 1, 0] = sums[b, 0] + px[b]
+        sums[b + 1, 1] = sums[b, 1] + py[b]
+        sums[b + 1, 2] = sums[b, 2] + px[b] * px[b]
+        sums[b + 1, 3] = sums[b, 3] + px[b] * py[b]
+        sums[b + 1, 4] = sums[b, 4] + py[b] * py[b]
     for b in range(beams):
         if kind[b] == 0:
             continue
-        x, y = points[b, 0], points[b, 1]
-        gap = np.inf
+        x, y = px[b], py[b]
+        gap2 = np.inf
         for k in (b - 1, b + 1):
             if 0 <= k < beams and kind[k] > 0:
-                gap = min(gap, np.hypot(points[k, 0] - x, points[k, 1] - y))
-        if gap > gap_max:
+                gap2 = min(gap2, (px[k] - x) ** 2 + (py[k] - y) ** 2)
+        if gap2 > gap_max * gap_max:
             continue
-        radius = max(radius_min, 2.5 * gap)
-        n, sx, sy, sxx, sxy, syy = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for step in (-1, 1):
-            k = b + step
-            while 0 <= k < beams and kind[k] > 0:
-                dx, dy = points[k, 0] - x, points[k, 1] - y
-                if dx * dx + dy * dy > radius * radius:
-                    break
-                n += 1.0
-                sx += dx
-                sy += dy
-                sxx += dx * dx
-                sxy += dx * dy
-                syy += dy * dy
-                k += step
+        radius2 = max(radius_min * radius_min, 6.25 * gap2)
+        first, last = b, b + 1
+        while first > 0 and kind[first - 1] > 0 and (px[first - 1] - x) ** 2 + (py[first - 1] - y) ** 2 <= radius2:
+            first -= 1
+        while last < beams and kind[last] > 0 and (px[last] - x) ** 2 + (py[last] - y) ** 2 <= radius2:
+            last += 1
+        n = float(last - first)
         if n < 3.0:
             continue
-        mx, my = sx / n, sy / n
-        cxx, cxy, cyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+        mx, my = (sums[last, 0] - sums[first, 0]) / n, (sums[last, 1] - sums[first, 1]) / n
+        cxx = (sums[last, 2] - sums[first, 2]) / n - mx * mx
+        cxy = (sums[last, 3] - sums[first, 3]) / n - mx * my
+        cyy = (sums[last, 4] - sums[first, 4]) / n - my * my
         half_trace, half_diff = 0.5 * (cxx + cyy), 0.5 * (cxx - cyy)
         root = np.sqrt(half_diff * half_diff + cxy * cxy)
         smallest, largest = max(half_trace - root, 0.0), half_trace + root
-        if smallest > surface_sigma * surface_sigma or smallest > 0.1 * largest:
+        if smallest > surface_sigma * surface_sigma or not smallest < 0.1 * largest:
             continue
-        angle = 0.5 * np.arctan2(2 * cxy, cxx - cyy)
-        nx, ny = -np.sin(angle), np.cos(angle)
+        # the eigenvector of the smallest eigenvalue, from the row of the matrix that is better conditioned
+        nx, ny = (-cxy, half_diff + root) if half_diff > 0 else (half_diff - root, cxy)
+        length = np.sqrt(nx * nx + ny * ny)
+        nx, ny = nx / length, ny / length
         if nx * x + ny * y > 0:
             nx, ny = -nx, -ny
         lines[b, 0], lines[b, 1] = nx, ny
-        lines[b, 2] = nx * (x + mx) + ny * (y + my)
+        lines[b, 2] = nx * mx + ny * my
         kind[b] = 2
 
 

@@ -41,7 +41,7 @@ def room_seen_with_noise(sigma_m: float) -> OccupancyGrid:
 def test_entropy_of_known_probabilities():
     p = np.array([[0.5, 0.8, 0.2, 0.99]])
     expected = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
-    assert entropy_bits(grid_of(np.log(p / (1 - p)))) == pytest.approx(expected, abs=1e-6)
+    assert entropy_bits(grid_of(np.log(p / (1 - p))).log_odds) == pytest.approx(expected, abs=1e-6)
 
 
 def test_certain_map_is_crisp_and_far_cells_do_not_count():
