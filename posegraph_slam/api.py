@@ -79,9 +79,11 @@ class Run:
     def save(self, folder: str | Path, *, overwrite: bool = False, figures: bool = True) -> Path:
         """Write everything into the run directory `folder`, as `psg optimize --out` does, and return it.
 
+        `figures` are the pictures and the report.
         The folder appears when it is complete. Raises InputError where it holds a run and `overwrite` is not set, or
         anything else.
         """
+        from posegraph_slam.report.page import write_report_of
         from posegraph_slam.report.run_figures import draw_figures  # matplotlib costs half a second
 
         clock = StageClock(dict(self._clock.seconds))
@@ -100,6 +102,8 @@ class Run:
                 jit_compile_s=self._compile_s,
             )
             directory.write_json(RECORD, record)
+            if figures:
+                write_report_of(directory, Path(folder).resolve().name)
         return Path(folder)
 
 

@@ -20,6 +20,7 @@ from posegraph_slam.cli import (
     localization,
     optimisation,
     particle_slam,
+    reporting,
     simulation,
     solving,
 )
@@ -90,6 +91,7 @@ def options(
 app.command("optimize", short_help="Optimise a log: trajectory, maps, comparison.")(optimisation.optimize)
 app.command("icp", short_help="Align clouds with the model of an object.")(alignment.icp)
 app.command("solve", short_help="Solve a pose graph and certify the optimum.")(solving.solve)
+app.command("report", short_help="Show a run in one HTML file.")(reporting.report)
 app.command("inspect", short_help="Show what is in a log, and what is suspicious.")(inspection.inspect)
 app.command("localize", short_help="Find the robot in a known map at every scan.")(localization.localize)
 app.command("pf-slam", short_help="Map a log with a particle filter.")(particle_slam.pf_slam)

@@ -47,6 +47,7 @@ def optimize(
         str | None,
         typer.Option("--from", metavar="STAGE", help="LOG is a run directory: start over from `matching` or `graph`."),
     ] = None,
+    page: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html at the end.")] = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -55,6 +56,7 @@ def optimize(
     """Turn a log into an optimised trajectory and maps, in a run directory of its own."""
     from posegraph_slam.pipeline.rerun import plan_run
     from posegraph_slam.pipeline.run import run
+    from posegraph_slam.report.page import REPORT, write_report_of
     from posegraph_slam.report.run_figures import draw_figures
 
     plan = plan_run(
@@ -71,11 +73,14 @@ def optimize(
             truth=truth,
             matching_of=plan.matching_of,
             draw=draw_figures,
+            report=write_report_of if page else None,
             progress=progress,
         )
     report(summary, partial(show, verbose=verbose), quiet=quiet, as_json=as_json)
     for picture in () if quiet or as_json else sorted(summary.folder.glob("figures/*.png")):
         typer.echo(f"picture:  {picture}")
+    if page and not (quiet or as_json):
+        typer.echo(f"report:   {summary.folder / REPORT}")
 
 
 def default_out(log: Path) -> Path:

@@ -29,11 +29,16 @@ class ComparisonTable:
     rows: tuple[ComparisonRow, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the table for JSON: the stages, and by metric its unit and the value of each stage."""
+        """Return the table for JSON: the stages, and by metric its unit, printed decimals and value of each stage."""
         return {
             "stages": list(self.stages),
             "rows": [
-                {"metric": row.name, "unit": row.unit, "values": dict(zip(self.stages, row.values, strict=True))}
+                {
+                    "metric": row.name,
+                    "unit": row.unit,
+                    "decimals": row.decimals,
+                    "values": dict(zip(self.stages, row.values, strict=True)),
+                }
                 for row in self.rows
             ],
         }

@@ -16,12 +16,17 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 def write_png(pixels: ByteArray, path: Path) -> None:
     """Write (R, C) grey, (R, C, 3) RGB or (R, C, 4) RGBA pixels, top row first, as a PNG."""
+    replace_file(path, png_bytes(pixels, path))
+
+
+def png_bytes(pixels: ByteArray, where: str | Path = "picture") -> bytes:
+    """Encode (R, C) grey, (R, C, 3) RGB or (R, C, 4) RGBA pixels, top row first; InputError names `where`."""
     if pixels.ndim == 3:
         pixels = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2)  # OpenCV wants BGR
     written, content = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 6])
     if not written:
-        raise InputError(path, f"pixels {pixels.shape} cannot be encoded as PNG")
-    replace_file(path, content.tobytes())
+        raise InputError(where, f"pixels {pixels.shape} cannot be encoded as PNG")
+    return content.tobytes()
 
 
 def read_image(path: Path) -> ByteArray:

@@ -130,6 +130,8 @@ def optimize(
         metrics={
             "stages": {name: metrics.as_dict() for name, metrics in measured.items()},
             **_summary(scans, matched, closed),
+            "remarks": [*log.remarks, *odometry.remarks, *matched.remarks],
+            "warnings": list(_warnings(closed)),
         },
         stages_s=clock.seconds,
         truth=log.truth,

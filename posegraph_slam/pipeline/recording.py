@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +16,9 @@ from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.run_directory import RECORD, RunDirectory, create_run_directory, require_free
 from posegraph_slam.pipeline.run_record import run_record
 from posegraph_slam.sensors import RobotLog
+
+Report = Callable[[RunDirectory, str], object]
+"""Writes the report of a run directory that holds all else, given the name that the run will have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +61,7 @@ def recorded_run(
     overwrite: bool = False,
     log_format: str | None = None,
     topics: Mapping[str, str] | None = None,
+    report: Report | None = None,
     command: Sequence[str] | None = None,
 ) -> Iterator[RunUnderWay]:
     """Read the log at `log_path`, yield the run to be done with it, and record how it went.
@@ -85,3 +89,5 @@ def recorded_run(
         )
         run.record = {**written, **run.inputs}
         directory.write_json(RECORD, run.record)
+        if report is not None:
+            report(directory, out.resolve().name)

@@ -12,7 +12,7 @@ from posegraph_slam.pipeline.configuration import Configuration, usable_workers
 from posegraph_slam.pipeline.executors import open_executor
 from posegraph_slam.pipeline.matching_file import MATCHING, read_matching
 from posegraph_slam.pipeline.optimize import OptimizationResult, optimize
-from posegraph_slam.pipeline.recording import RunSummary, recorded_run
+from posegraph_slam.pipeline.recording import Report, RunSummary, recorded_run
 from posegraph_slam.pipeline.run_directory import RunDirectory, read_run_directory
 from posegraph_slam.pipeline.saving import save_run
 
@@ -33,6 +33,7 @@ def run(
     truth: Path | None = None,
     matching_of: Path | None = None,
     draw: Draw | None = None,
+    report: Report | None = None,
     progress: Progress = silent_progress,
     command: Sequence[str] | None = None,
 ) -> RunSummary:
@@ -49,6 +50,7 @@ def run(
         overwrite=overwrite,
         log_format=log_format,
         topics=topics,
+        report=report,
         command=command,
     ) as under_way:
         log, clock = under_way.log, under_way.clock

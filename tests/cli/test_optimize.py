@@ -20,6 +20,7 @@ from posegraph_slam.pipeline.run_directory import read_run_directory
 
 FILES = {
     "run.json",
+    "report.html",
     "config.toml",
     "metrics.json",
     "odometry.tum",
@@ -64,6 +65,7 @@ def run(log: Path) -> Path:
     for word in ("odometry", "scan matching", "optimised", "APE position RMSE [m]", "start-end gap [m]", "peak memory"):
         assert word in result.stdout
     assert f"picture:  {out / 'figures' / 'map.png'}" in result.stdout
+    assert f"report:   {out / 'report.html'}" in result.stdout
     return out
 
 
@@ -116,7 +118,7 @@ def test_same_bytes_again_with_other_workers_and_from_its_own_configuration(run:
     assert result.exit_code == 0, result.output
     assert result.stdout == ""
     assert files(again) == files(run)
-    for name in sorted(files(run) - {"run.json", "config.toml"}):
+    for name in sorted(files(run) - {"run.json", "config.toml", "report.html"}):
         assert (again / name).read_bytes() == (run / name).read_bytes(), name
     hashes = [read_run_directory(folder).record["configuration_sha256"] for folder in (run, again)]
     assert hashes[0] == hashes[1]
@@ -175,9 +177,10 @@ def test_stages_and_reruns_from_the_command_line(run: Path, tmp_path: Path) -> N
     again = CliRunner().invoke(app, ["optimize", str(run), "--from", "graph", "--out", str(tmp_path / "again"), "-q"])
     assert again.exit_code == 0
     assert (tmp_path / "again/trajectory.tum").read_bytes() == (run / "trajectory.tum").read_bytes()
-    short = ["optimize", str(run), "--from", "graph", "--no-loops", "--stages", "odometry,matching"]
+    short = ["optimize", str(run), "--no-report", "--from", "graph", "--no-loops", "--stages", "odometry,matching"]
     assert CliRunner().invoke(app, [*short, "--out", str(tmp_path / "short"), "-q"]).exit_code == 0
     assert not (tmp_path / "short/maps").exists()
+    assert not (tmp_path / "short/report.html").exists()
     wrong = CliRunner().invoke(app, ["optimize", str(run), "--from", "maps"])
     assert wrong.exit_code == 2
     assert "it is matching or graph" in wrong.stderr
