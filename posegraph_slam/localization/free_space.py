@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray
+from posegraph_slam.localization.cell_counts import refresh_free_before
 from posegraph_slam.localization.slam_map import SlamMap, refresh_near
 from posegraph_slam.mapping.raycast import NEVER_SEEN
 
@@ -35,3 +36,5 @@ def draw_scan_by_polygon(slam_map: SlamMap, points: FloatArray, pose: FloatArray
     changes = np.argwhere((before > above) != (after > above))
     np.copyto(window, after.astype(np.int32), where=mask > 0)
     refresh_near(changes + low[::-1], slam_map.evidence, above, slam_map.reach, slam_map.near)
+    if slam_map.free_before is not None:
+        refresh_free_before(slam_map.evidence, slam_map.free_before, low[1], high[1] + 1, low[0], high[0] + 1)

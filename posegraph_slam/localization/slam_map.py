@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from posegraph_slam.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from posegraph_slam.jit import kernel
+from posegraph_slam.localization.cell_counts import free_before, refresh_free_before
 from posegraph_slam.localization.slam_settings import ParticleSlamSettings
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
@@ -39,6 +40,8 @@ class SlamMap:
     steps: IntArray
     """Units of a hit, of a miss, of the clamp, and above which a cell is an obstacle."""
     unit: float
+    free_before: Int32Array | None = None
+    """Free cells (R, C + 1) of each row to the left of every column, where cells are counted."""
 
     def occupancy(self) -> OccupancyGrid:
         """Return the map as an occupancy grid."""
@@ -64,6 +67,7 @@ def empty_map(geometry: GridGeometry, settings: ParticleSlamSettings) -> SlamMap
         reach=min(max(int(np.ceil(3 * settings.sigma_m / settings.resolution_m)), corner), 15),
         steps=steps,
         unit=unit,
+        free_before=free_before(np.full(geometry.shape, NEVER_SEEN)) if settings.weighting == "cell_counts" else None,
     )
 
 
@@ -76,18 +80,48 @@ def draw_scan(slam_map: SlamMap, points: FloatArray, pose: FloatArray, sensor: F
     slam_map.mark = slam_map.mark % 255 + 1
     if slam_map.mark == 1:
         slam_map.stamps[:] = 0
-    changes = np.empty((4096, 2), dtype=np.int64)
-    M = slam_map.geometry.cells_from_map @ _matrix(pose)
-    mark = np.uint8(slam_map.mark)
-    count = add_scan(points, M, sensor, slam_map.steps, slam_map.evidence, slam_map.stamps, mark, changes)
-    refresh_near(
-        changes[: min(count, len(changes))], slam_map.evidence, slam_map.steps[3], slam_map.reach, slam_map.near
-    )
+    M = cells_from_base(slam_map.geometry.cells_from_map, pose)
+    trace_scan(
+        points, M, sensor, slam_map.steps, slam_map.evidence, slam_map.near, slam_map.stamps,
+        np.uint8(slam_map.mark), slam_map.reach,
+    )  # fmt: skip
+    if slam_map.free_before is not None:
+        low_row, end_row, low_column, end_column = touched_box(points, sensor, M, *slam_map.geometry.shape)
+        refresh_free_before(slam_map.evidence, slam_map.free_before, low_row, end_row, low_column, end_column)
 
 
-def _matrix(pose: FloatArray) -> FloatArray:
+@kernel
+def cells_from_base(M, pose):  # type: ignore[no-untyped-def]
+    """Return the affine map (3, 3) from the base frame at `pose` (3,) to cells, `M` being that of the map frame."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([[c, -s, pose[0]], [s, c, pose[1]], [0.0, 0.0, 1.0]])
+    return M @ np.array([[c, -s, pose[0]], [s, c, pose[1]], [0.0, 0.0, 1.0]])
+
+
+@kernel
+def touched_box(points, sensor, M, rows, columns):  # type: ignore[no-untyped-def]
+    """Return low row, end row, low column, end column of the cells, within the grid, between sensor and returns."""
+    low_x = high_x = M[0, 0] * sensor[0] + M[0, 1] * sensor[1] + M[0, 2]
+    low_y = high_y = M[1, 0] * sensor[0] + M[1, 1] * sensor[1] + M[1, 2]
+    for b in range(len(points)):
+        x = M[0, 0] * points[b, 0] + M[0, 1] * points[b, 1] + M[0, 2]
+        y = M[1, 0] * points[b, 0] + M[1, 1] * points[b, 1] + M[1, 2]
+        low_x, high_x, low_y, high_y = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
+    low_row, low_column = min(max(int(np.floor(low_y)), 0), rows), min(max(int(np.floor(low_x)), 0), columns)
+    end_row, end_column = min(int(np.floor(high_y)) + 1, rows), min(int(np.floor(high_x)) + 1, columns)
+    return low_row, max(end_row, low_row), low_column, max(end_column, low_column)
+
+
+@kernel
+def trace_scan(points, M, sensor, steps, evidence, near, stamps, mark, reach):  # type: ignore[no-untyped-def]
+    """Add a scan by rays and bring the squared distances `near` around what changed up to date."""
+    changes = np.empty((4096, 2), dtype=np.int64)
+    count = add_scan(points, M, sensor, steps, evidence, stamps, mark, changes)
+    if count <= len(changes):
+        refresh_near(changes[:count], evidence, steps[3], reach, near)
+    else:
+        for row in range(near.shape[0]):
+            for column in range(near.shape[1]):
+                near[row, column] = nearest_obstacle(evidence, steps[3], reach, row, column)
 
 
 @kernel
@@ -102,7 +136,10 @@ def change_cell(evidence, at, step, clamp, above):  # type: ignore[no-untyped-de
 
 @kernel
 def add_scan(points, M, sensor, steps, evidence, stamps, mark, changes):  # type: ignore[no-untyped-def]
-    """Add hits, then misses on rays; write cells [row, column] whose class changed to `changes`, return how many."""
+    """Add hits, then misses on rays; write cells [row, column] whose class changed to `changes`.
+
+    Returns how many there were, which may be more than `changes` holds.
+    """
     rows, columns = evidence.shape
     total, marks = evidence.reshape(rows * columns), stamps.reshape(rows * columns)
     start, end = np.empty(2, dtype=np.int64), np.empty(2, dtype=np.int64)
@@ -117,8 +154,9 @@ def add_scan(points, M, sensor, steps, evidence, stamps, mark, changes):  # type
             marks[at] = mark
             rays[walked] = b
             walked += 1
-            if change_cell(total, at, hit, clamp, above) != 0 and count < len(changes):
-                changes[count, 0], changes[count, 1] = row, column
+            if change_cell(total, at, hit, clamp, above) != 0:
+                if count < len(changes):
+                    changes[count, 0], changes[count, 1] = row, column
                 count += 1
     fixed_point(M, sensor[0], sensor[1], start)
     for k in range(walked):
@@ -139,8 +177,9 @@ def add_scan(points, M, sensor, steps, evidence, stamps, mark, changes):  # type
                 old = np.int32(0) if before == NEVER_SEEN else before
                 new = max(old - miss, -clamp)
                 total[at] = new
-                if old > above and new <= above and count < len(changes):
-                    changes[count, 0], changes[count, 1] = index // columns, index % columns
+                if old > above and new <= above:
+                    if count < len(changes):
+                        changes[count, 0], changes[count, 1] = index // columns, index % columns
                     count += 1
             # `next_cell` written out: branches predict well along a ray and cost a tenth less here than selections.
             if lead < 0:

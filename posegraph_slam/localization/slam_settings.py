@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from posegraph_slam.localization.settings import MotionNoise, ResamplingSettings
 from posegraph_slam.settings import Settings
 
 
 class ParticleSlamSettings(Settings):
-    """Particle-filter SLAM: particles share the map that the best of them draws."""
+    """Particle-filter SLAM: particles share the map that the best of them draws, or each has its own."""
 
     particles: int = Field(default=100, ge=1)
     """Number of particles."""
+    maps: Literal["best", "per_particle"] = "best"
+    """One map that the best particle draws, or one of each particle: these cost memory and time, but each particle is
+    then weighed by a map of its own path."""
     weighting: Literal["likelihood_field", "window_correlation", "cell_counts"] = "likelihood_field"
     """How a scan fits the map: distance of returns to obstacles, best correlation in a window, or agreeing cells."""
     free_cells: Literal["rays", "polygon"] = "rays"
@@ -55,3 +58,9 @@ class ParticleSlamSettings(Settings):
     """Scans weigh the particles and draw the map after this way,"""
     update_turn_rad: float = Field(default=0.03, ge=0)
     """or this turn; 0 for every scan."""
+
+    @model_validator(mode="after")
+    def _check_maps(self) -> ParticleSlamSettings:
+        if self.maps == "per_particle" and self.free_cells != "rays":
+            raise ValueError(f"maps per_particle need free_cells rays, not {self.free_cells}")
+        return self

@@ -2,28 +2,66 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.jit import kernel
+from posegraph_slam.localization.cell_counts import count_scores, one_a_cell, scan_outline, straightened
 from posegraph_slam.localization.slam_map import FAR, SlamMap
 from posegraph_slam.localization.slam_settings import ParticleSlamSettings
-from posegraph_slam.mapping.raycast import FRACTION_BITS, NEVER_SEEN, fixed_point, next_cell, plan_walk
+from posegraph_slam.mapping.raycast import NEVER_SEEN
+
+STRAIGHT_CELLS = 0.5
+"""The outline of a scan keeps within half a cell: 0.5 % of the count changes, and half of the time is saved."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WeighedScan:
+    """What the weight functions need of a scan, in the base frame.
+
+    `few` (n, 2) are returns spread over the scan; `returns` one of each cell, and `outline` (m, 2) the polygon of its
+    free space, for counting cells; `table` is the likelihood by squared distance.
+    """
+
+    few: FloatArray
+    returns: FloatArray
+    outline: FloatArray
+    table: FloatArray
+
+
+def weighed_scan(points: FloatArray, sensor: FloatArray, reach: int, settings: ParticleSlamSettings) -> WeighedScan:
+    """Prepare the returns `points` (n, 2) (base frame), at least one, for the weight function of the settings."""
+    few, returns, outline = points, points, points
+    if settings.weighting == "cell_counts":
+        cell = settings.resolution_m
+        returns = one_a_cell(points, cell)
+        outline = straightened(scan_outline(points, sensor, cell), STRAIGHT_CELLS * cell)
+    else:
+        few = np.ascontiguousarray(points[:: -(-len(points) // settings.points_max)])
+    return WeighedScan(few=few, returns=returns, outline=outline, table=likelihood_table(reach, settings))
 
 
 def log_weights(
-    slam_map: SlamMap, particles: FloatArray, points: FloatArray, sensor: FloatArray, settings: ParticleSlamSettings
+    slam_map: SlamMap, particles: FloatArray, scan: WeighedScan, settings: ParticleSlamSettings
 ) -> FloatArray:
-    """Return what a scan with returns `points` (n, 2) (base frame) adds to the log-weights (N,) of the particles."""
+    """Return what a scan adds to the log-weights (N,) of the particles."""
     M = slam_map.geometry.cells_from_map
     if settings.weighting == "likelihood_field":
-        table = likelihood_table(slam_map.reach, settings)
-        scores = field_scores(particles, points, M, slam_map.evidence, slam_map.near, table)
-        return np.asarray(settings.beam_weight * scores)
-    if settings.weighting == "window_correlation":
-        scores = window_scores(particles, points, M, slam_map.near, settings.window_cells // 2)
+        scores = field_scores(particles, scan.few, M, slam_map.evidence, slam_map.near, scan.table)
+    elif settings.weighting == "window_correlation":
+        scores = window_scores(particles, scan.few, M, slam_map.near, settings.window_cells // 2)
     else:
-        scores = count_scores(particles, points, sensor, M, slam_map.evidence, slam_map.steps[3])
+        assert slam_map.free_before is not None
+        scores = count_scores(particles, scan.outline, scan.returns, M, slam_map.near, slam_map.free_before)
+    return from_scores(scores, settings)
+
+
+def from_scores(scores: FloatArray, settings: ParticleSlamSettings) -> FloatArray:
+    """Return the log-weights of scores (N,): sums of log-likelihoods, or counts whose power is the weight."""
+    if settings.weighting == "likelihood_field":
+        return np.asarray(settings.beam_weight * scores)
     return np.asarray(settings.correlation_power * np.log1p(np.maximum(scores, 0)))
 
 
@@ -84,40 +122,4 @@ def window_scores(particles, points, M, near, half):  # type: ignore[no-untyped-
                 for dx in range(width):  # without a branch, so that it runs on vectors
                     counts[dx] += np.int32(line[dx] == 0)
         scores[k] = sums.max()
-    return scores
-
-
-@kernel
-def count_scores(particles, points, sensor, M, evidence, above):  # type: ignore[no-untyped-def]
-    """Cells (N,) on which scan and map agree: returns in obstacles, and cells of the beams in known free space."""
-    rows, columns = evidence.shape
-    total = evidence.reshape(rows * columns)
-    start, end = np.empty(2, dtype=np.int64), np.empty(2, dtype=np.int64)
-    T = np.empty((3, 3))
-    scores = np.zeros(len(particles))
-    for k in range(len(particles)):
-        c, s = np.cos(particles[k, 2]), np.sin(particles[k, 2])
-        for i in range(2):
-            T[i, 0] = M[i, 0] * c + M[i, 1] * s
-            T[i, 1] = -M[i, 0] * s + M[i, 1] * c
-            T[i, 2] = M[i, 0] * particles[k, 0] + M[i, 1] * particles[k, 1] + M[i, 2]
-        fixed_point(T, sensor[0], sensor[1], start)
-        count = 0
-        for b in range(len(points)):
-            fixed_point(T, points[b, 0], points[b, 1], end)
-            low = min(start[0], start[1], end[0], end[1]) >> FRACTION_BITS
-            high_column = max(start[0], end[0]) >> FRACTION_BITS
-            high_row = max(start[1], end[1]) >> FRACTION_BITS
-            if low < 0 or high_column >= columns or high_row >= rows:
-                continue
-            walk = plan_walk(start, end, columns)
-            index, lead = walk.first, walk.lead
-            while index != walk.last:
-                at = np.uint64(index)
-                if total[at] < 0 and total[at] != NEVER_SEEN:
-                    count += 1
-                index, lead = next_cell(walk, index, lead)
-            if total[walk.last] > above:
-                count += 1
-        scores[k] = count
     return scores

@@ -60,6 +60,7 @@ def run_particle_slam(
             "stages": {name: each.as_dict() for name, each in measured.items()},
             "scans": len(scans),
             "resamplings": result.resamplings,
+            "map_memory_mib": result.map_bytes / 2**20,
             "mean_effective_number": float(result.effective.mean()),
         }
         with run.clock.stage("saving"):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
+from posegraph_slam.localization.motion import step_sigmas
+from posegraph_slam.localization.slam_settings import ParticleSlamSettings
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.sensors import LaserScans
@@ -135,3 +137,34 @@ def dense() -> World:
     truth = walk(240)[30:32]
     scans = make_scans(truth, rng, beams=1081)
     return World(grid=drawn_map(), scans=scans, truth=truth, odometry=make_odometry(truth, rng, scans.stamps_s))
+
+
+def ring(rng: np.random.Generator, count: int) -> tuple[LaserScans, Trajectory, np.ndarray]:
+    """A round trip about the pillar with a laser that sees 3 m, so that drift shows where the loop closes.
+
+    The odometry errs as the filter's own noise says.
+    """
+    corners = np.array([
+        [5, 1], [8.3, 1], [9.6, 2.5], [12.9, 2.3], [13, 5.2], [9.5, 5.2], [8, 7.5], [5.3, 7.6], [5, 4.4], [5, 1],
+        [8.3, 1],
+    ])  # fmt: skip
+    leg = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    s = np.linspace(0.3, leg[-1] - 0.3, count)
+    x, y = (np.mean([np.interp(s + d, leg, corners[:, k]) for d in np.linspace(-0.3, 0.3, 9)], axis=0) for k in (0, 1))
+    truth = np.stack([x, y, np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))], axis=1)
+    scans = make_scans(truth, rng)
+    scans = replace(scans, ranges_m=np.where(scans.ranges_m > 3, np.float32(60), scans.ranges_m))
+    steps = SE2.log(SE2.between(pose_from_xyt(truth[:-1]), pose_from_xyt(truth[1:])))
+    sigma = step_sigmas(steps, ParticleSlamSettings().noise)
+    steps = steps + sigma[:, [0, 0, 1]] * rng.standard_normal(steps.shape)
+    poses = [np.eye(3)]
+    for step in SE2.exp(steps):
+        poses.append(poses[-1] @ step)
+    odometry = Trajectory(stamps_s=scans.stamps_s, poses=np.array(poses), parent="odom", child="base")
+    return scans, odometry, SE2.between(pose_from_xyt(truth[:1]), pose_from_xyt(truth))
+
+
+@pytest.fixture(scope="session")
+def rings() -> list[tuple[LaserScans, Trajectory, np.ndarray]]:
+    """Two round trips: scans, odometry, and true poses relative to the first."""
+    return [ring(np.random.default_rng(seed), 200) for seed in (10, 11)]
