@@ -1,80 +1,24 @@
 """Multifrontal Cholesky factorisation of a sparse symmetric matrix of small square blocks, in numba.
 
-Each supernode gathers its blocks and the updates of its children in a dense front, eliminates its columns and hands
-the Schur complement to its parent by way of a stack (Duff and Reid 1983; Liu 1992). Small fronts, the rule in the
-plane, are worked on in plain loops; large ones, the rule in space, by products of panels that stay in cache. No BLAS:
-its threads cost more than they bring at these sizes, tenfold where other processes share the cores, and they would
-make the result depend on their number.
+Each supernode gathers its blocks and the updates of its children in a dense front, eliminates its rows and leaves the
+Schur complement to its parent (Duff and Reid 1983; Liu 1992). Upper triangles U with U^T U = M are kept: the pivot rows
+of a front are the factor's own storage, the rest is the update, on one of two stacks, so that nothing is copied. No
+BLAS: its threads cost more than they bring at these sizes, and they would make results depend on their number.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.jit import kernel
-from posegraph_slam.pose_graph.elimination import Elimination, analyze
+from posegraph_slam.pose_graph.block_pattern import BlockPattern
+from posegraph_slam.pose_graph.dense_tile import TILE, subtract_tile, subtract_wide_tile
 
-PANEL = 32
-"""Columns eliminated before the rest of a front is updated by one matrix product."""
-STRIP = 128
-"""Columns of that product made at a time: a panel of 32 rows of them, 32 KiB, stays in the first cache."""
-PRODUCT_ROWS = 48
-"""Fronts with fewer rows to update stay in plain loops: setting up the product costs more than it saves."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BlockPattern:
-    """Where the blocks of a symmetric matrix stand: n diagonal blocks and off-diagonal ones at (i, j), (E,) each.
-
-    Off-diagonal blocks may repeat a place; they add up.
-    """
-
-    block: int
-    elimination: Elimination
-    entry_start: IntArray
-    """Entries of each supernode (S+1,)."""
-    entry: IntArray
-    """Which block: below n a diagonal one, from n on off-diagonal ones; -1 - number: to be transposed."""
-    entry_row: IntArray
-    entry_column: IntArray
-    factor_start: IntArray
-    """Where the columns of each supernode begin in the factor's storage (S+1,)."""
-    largest_front: int
-    stack_size: int
-
-    @property
-    def size(self) -> int:
-        """Number of block rows."""
-        return len(self.elimination.position)
-
-
-def block_pattern(count: int, i: IntArray, j: IntArray, block: int) -> BlockPattern:
-    """Analyse a matrix of `count` block rows with off-diagonal blocks at (i, j) (E,), i != j."""
-    tree = analyze(count, i, j, block)
-    here, there = tree.position[i], tree.position[j]
-    column = np.concatenate([tree.position, np.minimum(here, there)])
-    row = np.concatenate([tree.position, np.maximum(here, there)])
-    number = np.arange(count + len(i))
-    number[count:] = np.where(here > there, number[count:], -1 - number[count:])
-    order = np.argsort(column, kind="stable")
-    column, row, number = column[order], row[order], number[order]
-    owner = tree.owner[column]
-    width, below = np.diff(tree.start), np.diff(tree.row_start)
-    sizes = (width + below) * width * block**2
-    return BlockPattern(
-        block=block,
-        elimination=tree,
-        entry_start=np.searchsorted(owner, np.arange(len(width) + 1)),
-        entry=number,
-        entry_row=_front_rows(row, owner, tree.start, tree.row_start, tree.rows),
-        entry_column=column - tree.start[owner],
-        factor_start=np.concatenate([[0], np.cumsum(sizes)]),
-        largest_front=int((width + below).max()) * block,
-        stack_size=_stack_size(below * block, tree.parent),
-    )
+PANEL = 48
+"""Pivot rows eliminated before the rest of a front is updated by them; a multiple of the tile."""
+STRIP = 96
+"""Columns of an update made at a time: a panel of them, 36 KiB, stays in the first cache."""
 
 
 def factorize(
@@ -84,246 +28,164 @@ def factorize(
 
     Returns the factor for `solve_factored`, or None where the matrix is not positive definite.
     """
-    tree, factor = pattern.elimination, np.empty(pattern.factor_start[-1])
-    front = np.empty(pattern.largest_front**2)
-    stack = np.empty(pattern.stack_size)
-    panel = np.empty(2 * pattern.largest_front * PANEL)
+    tree = pattern.elimination
+    # Tiles reach over the end of a supernode's rows into what is written later; the last one needs room for that.
+    factor = np.empty(pattern.factor_start[-1] + TILE * (pattern.largest_front + TILE))
+    stacks = np.empty(pattern.stack_sizes.sum())
     positive = _factorize(
-        pattern.block, tree.start, tree.row_start, tree.relative, tree.parent, pattern.entry_start, pattern.entry,
-        pattern.entry_row, pattern.entry_column, pattern.factor_start, diagonal, off_diagonal, damping,
-        factor, front, stack, panel)  # fmt: skip
+        pattern.block, tree.start, tree.row_start, tree.relative, tree.parent, pattern.side, pattern.stack_sizes,
+        pattern.entry_start, pattern.entry, pattern.entry_row, pattern.entry_column, pattern.factor_start, diagonal,
+        off_diagonal, damping, factor, stacks)  # fmt: skip
     return factor if positive else None
 
 
-def solve_factored(pattern: BlockPattern, factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve for the right-hand side (n, p) with a factor of `factorize`."""
-    tree = pattern.elimination
-    x = np.empty_like(right)
-    x[tree.position] = right
-    flat = x.reshape(-1)
-    _substitute(pattern.block, tree.start, tree.row_start, tree.rows, pattern.factor_start, factor, flat)
-    return np.asarray(x[tree.position])
+@kernel
+def _subtract_rows(target: FloatArray, t: int, target_stride: int, source: FloatArray, a: int, b: int,
+                   source_stride: int, depth: int, width: int) -> None:  # fmt: skip
+    """Do T -= A^T B on four rows of the target from t on, A (depth, 4) and B (depth, width) within the source."""
+    column = 0
+    while column + 2 * TILE <= width:
+        subtract_wide_tile(target, t + column, target_stride, source, a, b + column, source_stride, depth)
+        column += 2 * TILE
+    while column < width:
+        subtract_tile(target, t + column, target_stride, source, a, b + column, source_stride, depth)
+        column += TILE
 
 
 @kernel
-def _front_rows(row: IntArray, owner: IntArray, start: IntArray, row_start: IntArray, rows: IntArray) -> IntArray:
-    """Return the block row of each entry in the front of its supernode."""
-    result = np.empty(len(row), np.int64)
-    for k in range(len(row)):
-        node = owner[k]
-        if row[k] < start[node + 1]:
-            result[k] = row[k] - start[node]
-        else:
-            below = rows[row_start[node] : row_start[node + 1]]
-            result[k] = start[node + 1] - start[node] + np.searchsorted(below, row[k])
-    return result
-
-
-@kernel
-def _stack_size(rows: IntArray, parent: IntArray) -> int:
-    """Return the most entries that the stack of updates holds at once."""
-    waiting = np.zeros(len(rows), np.int64)  # entries that the children of each supernode left
-    used, most = 0, 0
-    for node in range(len(rows)):
-        used += rows[node] ** 2 - waiting[node]
-        most = max(most, used + waiting[node])
-        if parent[node] >= 0:
-            waiting[parent[node]] += rows[node] ** 2
-    return most
-
-
-@kernel
-def _eliminate_plainly(front: FloatArray, begin: int, end: int, reach: int, column: FloatArray) -> bool:
-    """Eliminate columns begin:end of the lower triangle, updating rows and columns up to `reach`."""
-    for pivot in range(begin, end):
-        value = front[pivot, pivot]
+def _finish_rows(factor: FloatArray, base: int, size: int, first: int, count: int) -> bool:
+    """Eliminate rows first:first+count, at most a tile, among themselves."""
+    for row in range(first, first + count):
+        target = factor[base + row * size + row : base + (row + 1) * size]
+        for above in range(first, row):
+            source = factor[base + above * size + row : base + (above + 1) * size]
+            scale = source[0]
+            for k in range(len(target)):
+                target[k] -= scale * source[k]
+        value = target[0]
         if not value > 0.0 or value == np.inf:
             return False
         scale = 1.0 / np.sqrt(value)
-        front[pivot, pivot] = np.sqrt(value)
-        count = reach - pivot - 1
-        source = column[:count]
-        for k in range(count):
-            source[k] = front[pivot + 1 + k, pivot] * scale
-            front[pivot + 1 + k, pivot] = source[k]
-        for row in range(count):
-            factor = source[row]
-            if factor != 0.0:
-                target = front[pivot + 1 + row, pivot + 1 : pivot + 2 + row]
-                for k in range(row + 1):  # from 0: then LLVM drops numba's wrap-around test and vectorises
-                    target[k] -= factor * source[k]
+        for k in range(len(target)):
+            target[k] *= scale
     return True
 
 
 @kernel
-def _inverse_lower(front: FloatArray, begin: int, width: int, inverse: FloatArray) -> None:
-    """Invert the lower triangle front[begin:begin+width, ...] into `inverse` (width, width)."""
-    inverse[:] = 0.0
-    for row in range(width):
-        target = inverse[row]
-        for k in range(row):
-            factor, source = front[begin + row, begin + k], inverse[k]
-            for m in range(k + 1):
-                target[m] -= factor * source[m]
-        scale = 1.0 / front[begin + row, begin + row]
-        for m in range(row):
-            target[m] *= scale
-        target[row] = scale
-
-
-@kernel
-def _subtract_rows(target: FloatArray, scale: FloatArray, rows: FloatArray, low: int) -> None:
-    """Do target -= scale @ rows[:len(scale), low:low+len(target)], four rows a pass."""
-    count, high = len(scale), low + len(target)
-    k = 0
-    while k + 4 <= count:
-        a, b, c, d = scale[k], scale[k + 1], scale[k + 2], scale[k + 3]
-        p, q = rows[k][low:high], rows[k + 1][low:high]
-        r, s = rows[k + 2][low:high], rows[k + 3][low:high]
-        for m in range(len(target)):
-            target[m] -= (a * p[m] + b * q[m]) + (c * r[m] + d * s[m])
-        k += 4
-    while k < count:
-        a, p = scale[k], rows[k][low:high]
-        for m in range(len(target)):
-            target[m] -= a * p[m]
-        k += 1
-
-
-@kernel
-def _eliminate(front: FloatArray, size: int, pivots: int, column: FloatArray, memory: FloatArray) -> bool:
-    """Eliminate the first `pivots` columns of the lower triangle of a front (size, size) in place."""
-    scale = np.empty(PANEL)
-    inverse_memory = np.empty(PANEL * PANEL)
+def _eliminate(factor: FloatArray, base: int, pivots: int, size: int, update: FloatArray, top: int,
+               stride: int) -> bool:  # fmt: skip
+    """Eliminate the pivot rows (pivots, size) at `base` and subtract what they say of the others from the update."""
     for begin in range(0, pivots, PANEL):
         end = min(begin + PANEL, pivots)
-        width, height = end - begin, size - end
-        if height < PRODUCT_ROWS or width < 8:
-            if not _eliminate_plainly(front, begin, end, size, column):
+        depth, panel = end - begin, base + begin * size
+        for row in range(begin, end, TILE):
+            if row > begin:
+                _subtract_rows(factor, base + row * size + row, size, factor, panel + row, panel + row, size,
+                               row - begin, size - row)  # fmt: skip
+            if not _finish_rows(factor, base, size, row, min(TILE, end - row)):
                 return False
-            continue
-        if not _eliminate_plainly(front, begin, end, end, column):
-            return False
-        inverse = inverse_memory[: width * width].reshape(width, width)
-        _inverse_lower(front, begin, width, inverse)
-        raw = memory[: width * height].reshape(width, height)
-        panel = memory[width * height : 2 * width * height].reshape(width, height)  # transposed: long rows
-        for row in range(height):
-            source = front[end + row, begin:end]
-            for k in range(width):
-                raw[k, row] = source[k]
-        panel[:] = 0.0
-        for k in range(width):
-            for m in range(k + 1):
-                scale[m] = -inverse[k, m]
-            _subtract_rows(panel[k], scale[: k + 1], raw, 0 * begin)  # a literal 0 would compile a second version
-        for row in range(height):
-            target = front[end + row, begin:end]
-            for k in range(width):
-                target[k] = panel[k, row]
-        for low in range(0, height, STRIP):
-            for row in range(low, height):
-                for k in range(width):
-                    scale[k] = panel[k, row]
-                reach = min(row + 1, low + STRIP)
-                _subtract_rows(front[end + row, end + low : end + reach], scale[:width], panel, low)
+        for row in range(end, pivots, TILE):
+            _subtract_rows(factor, base + row * size + row, size, factor, panel + row, panel + row, size, depth,
+                           size - row)  # fmt: skip
+        for low in range(0, stride, STRIP):
+            high = min(low + STRIP, stride)
+            for row in range(0, high, TILE):
+                left = max(low, row)
+                _subtract_rows(update, top + row * stride + left, stride, factor, panel + pivots + row,
+                               panel + pivots + left, size, depth, high - left)  # fmt: skip
     return True
 
 
 @kernel
-def _factorize(p: int, start: IntArray, row_start: IntArray, relative: IntArray, parent: IntArray,
-               entry_start: IntArray, entry: IntArray, entry_row: IntArray, entry_column: IntArray,
-               factor_start: IntArray, diagonal: FloatArray, off_diagonal: FloatArray, damping: float,
-               factor: FloatArray, front_memory: FloatArray, stack: FloatArray,
-               panel: FloatArray) -> bool:  # fmt: skip
-    count, supernodes = len(diagonal), len(parent)
-    top = 0
-    pending = np.empty(supernodes, np.int64)  # supernodes whose updates lie on the stack
-    waiting = 0
-    largest = 0
-    for node in range(supernodes):
-        largest = max(largest, start[node + 1] - start[node] + row_start[node + 1] - row_start[node])
-    column_memory, scalar = np.empty(largest * p), np.empty(largest * p, np.int64)
-    for node in range(supernodes):
-        pivots = (start[node + 1] - start[node]) * p
-        size = pivots + (row_start[node + 1] - row_start[node]) * p
-        front = front_memory[: size * size].reshape(size, size)
-        for row in range(size):
-            target = front[row]
-            for k in range(row + 1):
-                target[k] = 0.0
-        for slot in range(entry_start[node], entry_start[node + 1]):
-            row, column, which = entry_row[slot] * p, entry_column[slot] * p, entry[slot]
+def _gather(p: int, first: int, last: int, entry: IntArray, entry_row: IntArray, entry_column: IntArray,
+            diagonal: FloatArray, off_diagonal: FloatArray, damping: float, pivot_rows: FloatArray) -> None:  # fmt: skip
+    """Add a supernode's own blocks to its pivot rows."""
+    count = len(diagonal)
+    for slot in range(first, last):
+        row, column, which = entry_row[slot] * p, entry_column[slot] * p, entry[slot]
+        if which < 0:
+            block = off_diagonal[-1 - which - count]
             for a in range(p):
                 for b in range(p):
-                    if which < 0:
-                        front[row + a, column + b] += off_diagonal[-1 - which - count, b, a]
-                    elif which >= count:
-                        front[row + a, column + b] += off_diagonal[which - count, a, b]
-                    elif b <= a:
-                        front[row + a, column + b] += diagonal[which, a, b] + (damping if a == b else 0.0)
-        while waiting > 0 and parent[pending[waiting - 1]] == node:
-            waiting -= 1
-            child = pending[waiting]
-            rows = row_start[child + 1] - row_start[child]
-            top -= (rows * p) ** 2
-            update = stack[top : top + (rows * p) ** 2].reshape(rows * p, rows * p)
-            for r in range(rows):
-                for a in range(p):
-                    scalar[r * p + a] = relative[row_start[child] + r] * p + a
-            for row in range(rows * p):
-                source, target = update[row], front[scalar[row]]
-                for k in range(row + 1):
-                    target[scalar[k]] += source[k]
-        if not _eliminate(front, size, pivots, column_memory, panel):
-            return False
-        columns = factor[factor_start[node] : factor_start[node + 1]].reshape(size, pivots)
-        for row in range(size):
-            source, target = front[row], columns[row]
-            for k in range(pivots):
-                target[k] = source[k]
-        rest = size - pivots
-        if rest > 0:
-            update = stack[top : top + rest * rest].reshape(rest, rest)
-            for row in range(rest):
-                source, target = front[pivots + row, pivots:], update[row]
-                for k in range(row + 1):
-                    target[k] = source[k]
-            top += rest * rest
-            pending[waiting] = node
-            waiting += 1
-    return True
+                    pivot_rows[row + a, column + b] += block[b, a]
+        else:
+            block = diagonal[which] if which < count else off_diagonal[which - count]
+            for a in range(p):
+                for b in range(p):
+                    pivot_rows[row + a, column + b] += block[a, b]
+        if 0 <= which < count:
+            for a in range(p):
+                pivot_rows[row + a, column + a] += damping
 
 
 @kernel
-def _substitute(p: int, start: IntArray, row_start: IntArray, rows: IntArray, factor_start: IntArray,
-                factor: FloatArray, x: FloatArray) -> None:  # fmt: skip
-    supernodes = len(start) - 1
+def _join_runs(p: int, relative: IntArray, runs: IntArray) -> int:
+    """Write begin, end (3, n) of pieces of a child's rows that stay together in the parent, and where; return n."""
+    found, block = 0, 0
+    while block < len(relative):
+        behind = block + 1
+        while behind < len(relative) and relative[behind] == relative[behind - 1] + 1:
+            behind += 1
+        runs[0, found], runs[1, found], runs[2, found] = block * p, behind * p, relative[block] * p
+        found, block = found + 1, behind
+    return found
+
+
+@kernel
+def _add_update(runs: IntArray, count: int, child: FloatArray, pivot_rows: FloatArray, update: FloatArray) -> None:
+    """Add the upper triangle of a child's update to the pivot rows and the update of its parent."""
+    pivots = len(pivot_rows)
+    for first in range(count):
+        begin, end, place = runs[0, first], runs[1, first], runs[2, first]
+        for row in range(begin, end):
+            at, source = place + row - begin, child[row]
+            inside = at < pivots
+            target = pivot_rows[at] if inside else update[at - pivots]
+            shift = at if inside else at - pivots
+            piece, into = source[row:end], target[shift : shift + end - row]
+            for k in range(len(piece)):
+                into[k] += piece[k]
+            for run in range(first + 1, count):
+                shift = runs[2, run] if inside else runs[2, run] - pivots
+                piece = source[runs[0, run] : runs[1, run]]
+                into = target[shift : shift + len(piece)]
+                for k in range(len(piece)):
+                    into[k] += piece[k]
+
+
+@kernel
+def _factorize(p: int, start: IntArray, row_start: IntArray, relative: IntArray, parent: IntArray, side: IntArray,
+               stack_sizes: IntArray, entry_start: IntArray, entry: IntArray, entry_row: IntArray,
+               entry_column: IntArray, factor_start: IntArray, diagonal: FloatArray, off_diagonal: FloatArray,
+               damping: float, factor: FloatArray, stacks: FloatArray) -> bool:  # fmt: skip
+    supernodes = len(parent)
+    top = np.zeros(2, np.int64)
+    top[1] = stack_sizes[0]
+    waiting = np.zeros(2, np.int64)  # how many, and which, supernodes' updates lie on each stack
+    pending = np.empty((2, supernodes), np.int64)
+    runs = np.empty((3, np.max(np.diff(row_start)) + 1), np.int64)
     for node in range(supernodes):
-        base, pivots = start[node] * p, (start[node + 1] - start[node]) * p
-        below = rows[row_start[node] : row_start[node + 1]]
-        columns = factor[factor_start[node] : factor_start[node + 1]].reshape(pivots + len(below) * p, pivots)
-        for row in range(pivots):
-            value = x[base + row]
-            for k in range(row):
-                value -= columns[row, k] * x[base + k]
-            x[base + row] = value / columns[row, row]
-        for r in range(len(below)):
-            for a in range(p):
-                value = 0.0
-                for k in range(pivots):
-                    value += columns[pivots + r * p + a, k] * x[base + k]
-                x[below[r] * p + a] -= value
-    for node in range(supernodes - 1, -1, -1):
-        base, pivots = start[node] * p, (start[node + 1] - start[node]) * p
-        below = rows[row_start[node] : row_start[node + 1]]
-        columns = factor[factor_start[node] : factor_start[node + 1]].reshape(pivots + len(below) * p, pivots)
-        for r in range(len(below)):
-            for a in range(p):
-                value = x[below[r] * p + a]
-                for k in range(pivots):
-                    x[base + k] -= columns[pivots + r * p + a, k] * value
-        for row in range(pivots - 1, -1, -1):
-            x[base + row] /= columns[row, row]
-            for k in range(row):
-                x[base + k] -= columns[row, k] * x[base + row]
+        pivots, rest = (start[node + 1] - start[node]) * p, (row_start[node + 1] - row_start[node]) * p
+        mine, size, stride = side[node], pivots + rest, (rest + TILE - 1) // TILE * TILE
+        base, other = factor_start[node], 1 - mine
+        factor[base : base + pivots * size] = 0.0
+        stacks[top[mine] : top[mine] + stride * stride] = 0.0
+        pivot_rows = factor[base : base + pivots * size].reshape(pivots, size)
+        update = stacks[top[mine] : top[mine] + stride * stride].reshape(stride, stride)
+        _gather(p, entry_start[node], entry_start[node + 1], entry, entry_row, entry_column, diagonal, off_diagonal,
+                damping, pivot_rows)  # fmt: skip
+        while waiting[other] > 0 and parent[pending[other, waiting[other] - 1]] == node:
+            waiting[other] -= 1
+            child = pending[other, waiting[other]]
+            length = ((row_start[child + 1] - row_start[child]) * p + TILE - 1) // TILE * TILE
+            top[other] -= length * length
+            count = _join_runs(p, relative[row_start[child] : row_start[child + 1]], runs)
+            below = stacks[top[other] : top[other] + length * length].reshape(length, length)
+            _add_update(runs, count, below, pivot_rows, update)
+        if not _eliminate(factor, base, pivots, size, stacks, top[mine], stride):
+            return False
+        if rest > 0:
+            top[mine] += stride * stride
+            pending[mine, waiting[mine]] = node
+            waiting[mine] += 1
+    return True

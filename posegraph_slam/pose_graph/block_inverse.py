@@ -1,8 +1,8 @@
 """Parts of the inverse of a factored block matrix: its diagonal blocks, and whole block columns.
 
-The diagonal comes from Takahashi's recursion on supernodes: with F the front of a supernode, J its columns and R the
-rows below, Z_RJ = -Z_RR L_RJ L_JJ^-1 and Z_JJ = L_JJ^-T L_JJ^-1 - L_JJ^-T L_RJ^T Z_RJ, from the last supernode
-to the first; Z_RR lies in the front of the parent (Erisman and Tinney 1975).
+The diagonal comes from Takahashi's recursion on supernodes: with J the pivots of a supernode and R the rest of its
+front, Z_RJ = -Z_RR U_JR^T U_JJ^-T and Z_JJ = U_JJ^-1 U_JJ^-T - U_JJ^-1 U_JR Z_RJ, from the last supernode to the
+first; Z_RR lies in the front of the parent (Erisman and Tinney 1975).
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.jit import kernel
-from posegraph_slam.pose_graph.block_cholesky import BlockPattern
+from posegraph_slam.pose_graph.block_pattern import BlockPattern
+from posegraph_slam.pose_graph.block_substitution import solve_many
 
 
 def inverse_diagonal(pattern: BlockPattern, factor: FloatArray) -> FloatArray:
@@ -27,13 +28,11 @@ def inverse_diagonal(pattern: BlockPattern, factor: FloatArray) -> FloatArray:
 
 def inverse_columns(pattern: BlockPattern, factor: FloatArray, rows: IntArray) -> FloatArray:
     """Return the block columns (n, p, K, p) of the inverse that belong to block rows `rows` (K,)."""
-    tree, p = pattern.elimination, pattern.block
-    x = np.zeros((pattern.size, p, len(rows), p))
+    p = pattern.block
+    right = np.zeros((pattern.size, p, len(rows), p))
     for k in range(p):
-        x[tree.position[rows], k, np.arange(len(rows)), k] = 1.0
-    flat = x.reshape(pattern.size * p, len(rows) * p)
-    _substitute_many(p, tree.start, tree.row_start, tree.rows, pattern.factor_start, factor, flat)
-    return np.asarray(x[tree.position])
+        right[rows, k, np.arange(len(rows)), k] = 1.0
+    return solve_many(pattern, factor, right.reshape(pattern.size, p, -1)).reshape(right.shape)
 
 
 @kernel
@@ -56,7 +55,7 @@ def _inverse_diagonal(p: int, start: IntArray, row_start: IntArray, relative: In
     for node in range(supernodes - 1, -1, -1):
         pivots, rest = (start[node + 1] - start[node]) * p, (row_start[node + 1] - row_start[node]) * p
         size, above = pivots + rest, parent[node]
-        L = factor[factor_start[node] : factor_start[node + 1]].reshape(size, pivots)
+        U = factor[factor_start[node] : factor_start[node + 1]].reshape(pivots, size)
         offset[node] = 0
         if above >= 0:
             upper = (start[above + 1] - start[above] + row_start[above + 1] - row_start[above]) * p
@@ -73,9 +72,9 @@ def _inverse_diagonal(p: int, start: IntArray, row_start: IntArray, relative: In
                     target[pivots + c] = source[where[c]]
         # Column by column from the last pivot: all of Z below and right of it is known by then.
         for k in range(pivots - 1, -1, -1):
-            scale = 1.0 / L[k, k]
+            scale = 1.0 / U[k, k]
             for row in range(k + 1, size):
-                column[row] = L[row, k] * scale
+                column[row] = U[k, row] * scale
             result, count = Z[k, k + 1 : size], size - k - 1
             for m in range(count):
                 result[m] = 0.0
@@ -92,38 +91,3 @@ def _inverse_diagonal(p: int, start: IntArray, row_start: IntArray, relative: In
             for r in range(p):
                 for c in range(p):
                     blocks[start[node] + b, r, c] = Z[b * p + r, b * p + c]
-
-
-@kernel
-def _substitute_many(p: int, start: IntArray, row_start: IntArray, rows: IntArray, factor_start: IntArray,
-                     factor: FloatArray, x: FloatArray) -> None:  # fmt: skip
-    """Solve in place for many right-hand sides x (n * p, m)."""
-    supernodes, many = len(start) - 1, x.shape[1]
-    for node in range(supernodes):
-        base, pivots = start[node] * p, (start[node + 1] - start[node]) * p
-        below = rows[row_start[node] : row_start[node + 1]]
-        L = factor[factor_start[node] : factor_start[node + 1]].reshape(pivots + len(below) * p, pivots)
-        for row in range(len(L)):
-            target = x[base + row] if row < pivots else x[below[(row - pivots) // p] * p + (row - pivots) % p]
-            for k in range(min(row, pivots)):
-                scale, source = L[row, k], x[base + k]
-                for m in range(many):
-                    target[m] -= scale * source[m]
-            if row < pivots:
-                scale = 1.0 / L[row, row]
-                for m in range(many):
-                    target[m] *= scale
-    for node in range(supernodes - 1, -1, -1):
-        base, pivots = start[node] * p, (start[node + 1] - start[node]) * p
-        below = rows[row_start[node] : row_start[node + 1]]
-        L = factor[factor_start[node] : factor_start[node + 1]].reshape(pivots + len(below) * p, pivots)
-        for row in range(len(L) - 1, -1, -1):
-            source = x[base + row] if row < pivots else x[below[(row - pivots) // p] * p + (row - pivots) % p]
-            if row < pivots:
-                scale = 1.0 / L[row, row]
-                for m in range(many):
-                    source[m] *= scale
-            for k in range(min(row, pivots)):
-                scale, target = L[row, k], x[base + k]
-                for m in range(many):
-                    target[m] -= scale * source[m]

@@ -17,7 +17,9 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from posegraph_slam.arrays import BoolArray, FloatArray
 from posegraph_slam.errors import GraphError
 from posegraph_slam.geometry import pose_from_rotation_translation
-from posegraph_slam.pose_graph.block_cholesky import BlockPattern, block_pattern, factorize, solve_factored
+from posegraph_slam.pose_graph.block_cholesky import factorize
+from posegraph_slam.pose_graph.block_pattern import BlockPattern, block_pattern
+from posegraph_slam.pose_graph.block_substitution import solve_factored
 from posegraph_slam.pose_graph.checks import component_labels
 from posegraph_slam.pose_graph.chordal import chordal_poses
 from posegraph_slam.pose_graph.chordal_cost import (

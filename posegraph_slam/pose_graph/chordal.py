@@ -12,7 +12,9 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import GraphError
 from posegraph_slam.geometry import pose_from_rotation_translation
-from posegraph_slam.pose_graph.block_cholesky import BlockPattern, block_pattern, factorize, solve_factored
+from posegraph_slam.pose_graph.block_cholesky import factorize
+from posegraph_slam.pose_graph.block_pattern import BlockPattern, block_pattern
+from posegraph_slam.pose_graph.block_substitution import solve_factored
 from posegraph_slam.pose_graph.graph import PoseGraph
 
 

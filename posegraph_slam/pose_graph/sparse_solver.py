@@ -13,7 +13,9 @@ import numpy as np
 
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.execution import Progress
-from posegraph_slam.pose_graph.block_cholesky import BlockPattern, block_pattern, factorize, solve_factored
+from posegraph_slam.pose_graph.block_cholesky import factorize
+from posegraph_slam.pose_graph.block_pattern import BlockPattern, block_pattern
+from posegraph_slam.pose_graph.block_substitution import solve_factored
 from posegraph_slam.pose_graph.graph import PoseGraph
 from posegraph_slam.pose_graph.linearization import (
     jacobians_at,

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.geometry import SE3, Group
-from posegraph_slam.pose_graph.block_cholesky import block_pattern, factorize, solve_factored
+from posegraph_slam.pose_graph.block_cholesky import factorize
+from posegraph_slam.pose_graph.block_pattern import block_pattern
+from posegraph_slam.pose_graph.block_substitution import solve_factored
 from posegraph_slam.pose_graph.elimination import analyze, minimum_degree
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
 from posegraph_slam.pose_graph.linearization import (
