@@ -26,6 +26,8 @@ def factorize(
 ) -> FloatArray | None:
     """Factor M + damping I given the blocks of M: `diagonal` (n, p, p) and `off_diagonal` (E, p, p) at (i, j).
 
+    Blocks of rows that the pattern leaves out are not looked at.
+
     Returns the factor for `solve_factored`, or None where the matrix is not positive definite.
     """
     tree = pattern.elimination
@@ -98,7 +100,8 @@ def _eliminate(factor: FloatArray, base: int, pivots: int, size: int, update: Fl
 
 @kernel
 def _gather(p: int, first: int, last: int, entry: IntArray, entry_row: IntArray, entry_column: IntArray,
-            diagonal: FloatArray, off_diagonal: FloatArray, damping: float, pivot_rows: FloatArray) -> None:  # fmt: skip
+            diagonal: FloatArray, off_diagonal: FloatArray, damping: float,
+            pivot_rows: FloatArray) -> None:  # fmt: skip
     """Add a supernode's own blocks to its pivot rows."""
     count = len(diagonal)
     for slot in range(first, last):

@@ -16,23 +16,25 @@ from posegraph_slam.pose_graph.block_substitution import solve_many
 
 
 def inverse_diagonal(pattern: BlockPattern, factor: FloatArray) -> FloatArray:
-    """Return the diagonal blocks (n, p, p) of the inverse of a matrix factored by `factorize`."""
+    """Return the diagonal blocks (n, p, p) of the inverse of a matrix factored by `factorize`, zero where left out."""
     tree = pattern.elimination
     sizes = pattern.block * (np.diff(tree.start) + np.diff(tree.row_start))
-    blocks = np.empty((pattern.size, pattern.block, pattern.block))
+    blocks = np.empty((len(pattern.rows), pattern.block, pattern.block))
     stack = np.empty(_path_size(sizes, tree.parent))
     _inverse_diagonal(pattern.block, tree.start, tree.row_start, tree.relative, tree.parent, pattern.factor_start,
                       factor, pattern.largest_front, stack, blocks)  # fmt: skip
-    return np.asarray(blocks[tree.position])
+    result = np.zeros((pattern.count, *blocks.shape[1:]))
+    result[pattern.rows] = blocks[tree.position]
+    return result
 
 
 def inverse_columns(pattern: BlockPattern, factor: FloatArray, rows: IntArray) -> FloatArray:
     """Return the block columns (n, p, K, p) of the inverse that belong to block rows `rows` (K,)."""
     p = pattern.block
-    right = np.zeros((pattern.size, p, len(rows), p))
+    right = np.zeros((pattern.count, p, len(rows), p))
     for k in range(p):
         right[rows, k, np.arange(len(rows)), k] = 1.0
-    return solve_many(pattern, factor, right.reshape(pattern.size, p, -1)).reshape(right.shape)
+    return solve_many(pattern, factor, right.reshape(pattern.count, p, -1)).reshape(right.shape)
 
 
 @kernel

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from posegraph_slam.arrays import IntArray
+from posegraph_slam.arrays import BoolArray, IntArray
 from posegraph_slam.jit import kernel
 from posegraph_slam.pose_graph.dense_tile import TILE
 from posegraph_slam.pose_graph.elimination import Elimination, analyze
@@ -16,10 +16,14 @@ from posegraph_slam.pose_graph.elimination import Elimination, analyze
 class BlockPattern:
     """Where the blocks of a symmetric matrix stand: n diagonal blocks and off-diagonal ones at (i, j), (E,) each.
 
-    Off-diagonal blocks may repeat a place; they add up.
+    Off-diagonal blocks may repeat a place; they add up. Of the matrix only the rows and columns `rows` (k,) are
+    factored.
     """
 
     block: int
+    count: int
+    """Block rows n of the whole matrix."""
+    rows: IntArray
     elimination: Elimination
     entry_start: IntArray
     """Entries of each supernode (S+1,)."""
@@ -36,20 +40,22 @@ class BlockPattern:
     stack_sizes: IntArray
     """Entries that each of the stacks needs."""
 
-    @property
-    def size(self) -> int:
-        """Number of block rows."""
-        return len(self.elimination.position)
 
+def block_pattern(count: int, i: IntArray, j: IntArray, block: int, *, kept: BoolArray | None = None) -> BlockPattern:
+    """Analyse a matrix of `count` block rows with off-diagonal blocks at (i, j) (E,), i != j.
 
-def block_pattern(count: int, i: IntArray, j: IntArray, block: int) -> BlockPattern:
-    """Analyse a matrix of `count` block rows with off-diagonal blocks at (i, j) (E,), i != j."""
-    tree = analyze(count, i, j, block)
+    `kept` (count,) marks the rows and columns that stay; at least one must.
+    """
+    rows, inner = np.arange(count), np.arange(len(i))
+    if kept is not None:
+        rows, inner = np.flatnonzero(kept), np.flatnonzero(kept[i] & kept[j])
+        place = np.cumsum(kept) - 1
+        i, j = place[i[inner]], place[j[inner]]
+    tree = analyze(len(rows), i, j, block)
     here, there = tree.position[i], tree.position[j]
     row = np.concatenate([tree.position, np.minimum(here, there)])
     column = np.concatenate([tree.position, np.maximum(here, there)])
-    number = np.arange(count + len(i))
-    number[count:] = np.where(here < there, number[count:], -1 - number[count:])
+    number = np.concatenate([rows, np.where(here < there, count + inner, -1 - count - inner)])
     order = np.argsort(row, kind="stable")
     row, column, number = row[order], column[order], number[order]
     owner = tree.owner[row]
@@ -57,6 +63,8 @@ def block_pattern(count: int, i: IntArray, j: IntArray, block: int) -> BlockPatt
     side, stack_sizes = _stacks(stored_update(below * block), tree.parent)
     return BlockPattern(
         block=block,
+        count=count,
+        rows=rows,
         elimination=tree,
         entry_start=np.searchsorted(owner, np.arange(len(width) + 1)),
         entry=number,

@@ -10,25 +10,32 @@ from posegraph_slam.pose_graph.block_pattern import BlockPattern
 
 
 def solve_factored(pattern: BlockPattern, factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve for the right-hand side (n, p) with a factor of `factorize`."""
+    """Solve for the right-hand side (n, p) with a factor of `factorize`; rows that are left out get zero."""
     tree = pattern.elimination
-    x = np.empty_like(right)
-    x[tree.position] = right
+    x = np.empty((len(pattern.rows), pattern.block))
+    x[tree.position] = right[pattern.rows]
     front = np.empty(pattern.largest_front)
     _substitute(
         pattern.block, tree.start, tree.row_start, tree.rows, pattern.factor_start, factor, x.reshape(-1), front
     )
-    return np.asarray(x[tree.position])
+    return _whole(pattern, x)
 
 
 def solve_many(pattern: BlockPattern, factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve for right-hand sides (n, p, m)."""
+    """Solve for right-hand sides (n, p, m); rows that are left out get zero."""
     tree = pattern.elimination
-    x = np.empty(right.shape)
-    x[tree.position] = right
+    x = np.empty((len(pattern.rows), *right.shape[1:]))
+    x[tree.position] = right[pattern.rows]
     flat = x.reshape(-1, right.shape[2])
     _substitute_many(pattern.block, tree.start, tree.row_start, tree.rows, pattern.factor_start, factor, flat)
-    return np.asarray(x[tree.position])
+    return _whole(pattern, x)
+
+
+def _whole(pattern: BlockPattern, x: FloatArray) -> FloatArray:
+    """Return values in the order of elimination as rows of the whole matrix."""
+    result = np.zeros((pattern.count, *x.shape[1:]))
+    result[pattern.rows] = x[pattern.elimination.position]
+    return result
 
 
 @kernel

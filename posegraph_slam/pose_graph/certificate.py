@@ -184,10 +184,8 @@ def _unfit(graph: PoseGraph) -> str | None:
 def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) -> tuple[Lifted, float]:
     """Minimise F from lifted poses by damped Newton steps with the exact Hessian; `anchors` (n,) do not move."""
     d, rank = problem.dimension, at.Q.shape[1]
-    basis, rows = tangents(d, rank), np.flatnonzero(~anchors)
-    place = np.cumsum(~anchors) - 1
-    inner = ~(anchors[problem.i] | anchors[problem.j])
-    pattern = block_pattern(len(rows), place[problem.i[inner]], place[problem.j[inner]], len(basis.row))
+    basis = tangents(d, rank)
+    pattern = block_pattern(len(anchors), problem.i, problem.j, len(basis.row), kept=~anchors)
     cost, G = value(problem, at)
     damping, before = 0.0, np.inf
     for _ in range(NEWTON_ITERATIONS):
@@ -195,13 +193,11 @@ def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) ->
         S = certificate_diagonal(problem, multipliers(at, G))
         diagonal, off = tangent_hessian(at.Q, problem.i, problem.j, S, problem.off_diagonal, basis.row, basis.column,
                                         basis.sign)  # fmt: skip
-        diagonal, off = diagonal[rows], off[inner]
         least = 1e-10 * float(np.mean(np.abs(np.trace(problem.diagonal, axis1=1, axis2=2))))
         while True:
             factor = factorize(pattern, diagonal, off, damping)
             if factor is not None:
-                delta = np.zeros_like(gradient)
-                delta[rows] = -solve_factored(pattern, factor, gradient[rows])
+                delta = -solve_factored(pattern, factor, gradient)
                 predicted = -float(np.sum(delta * gradient))
                 trial = moved(at, basis, delta, d)
                 new_cost, new_G = value(problem, trial)

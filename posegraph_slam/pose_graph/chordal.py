@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import GraphError
 from posegraph_slam.geometry import pose_from_rotation_translation
+from posegraph_slam.jit import kernel
 from posegraph_slam.pose_graph.block_cholesky import factorize
 from posegraph_slam.pose_graph.block_pattern import BlockPattern, block_pattern
-from posegraph_slam.pose_graph.block_substitution import solve_factored
+from posegraph_slam.pose_graph.block_substitution import solve_many
 from posegraph_slam.pose_graph.graph import PoseGraph
 
 
@@ -26,10 +27,8 @@ def chordal_poses(graph: PoseGraph) -> FloatArray:
     """
     if graph.fixed.all():
         return graph.poses
-    c, d = graph.constraints, graph.group.dimension
-    place = np.cumsum(~graph.fixed) - 1
-    inner = ~(graph.fixed[c.i] | graph.fixed[c.j])
-    pattern = block_pattern(int((~graph.fixed).sum()), place[c.i[inner]], place[c.j[inner]], d)
+    c = graph.constraints
+    pattern = block_pattern(len(graph), c.i, c.j, graph.group.dimension, kept=~graph.fixed)
     rotations = _rotations(graph, pattern)
     return pose_from_rotation_translation(rotations, _translations(graph, pattern, rotations))
 
@@ -62,8 +61,8 @@ def _translations(graph: PoseGraph, pattern: BlockPattern, rotations: FloatArray
     W = R @ c.information[:, shift, shift] @ np.swapaxes(R, 1, 2)
     pull = W @ (R @ c.T_i_j[:, :d, d, None])
     right = np.zeros((len(graph), d, 1))
-    np.add.at(right, c.i, -pull)
-    np.add.at(right, c.j, pull)
+    _add_blocks(right, c.i, -pull)
+    _add_blocks(right, c.j, pull)
     t = _solve(graph, pattern, W, W, -W, right, graph.poses[:, :d, d, None])[..., 0]
     return np.where(graph.fixed[:, None], graph.poses[:, :d, d], t)
 
@@ -81,17 +80,25 @@ def _solve(
 
     Fixed nodes keep the values `known` (N, d, m) and move to the right-hand side.
     """
-    c, free = graph.constraints, np.flatnonzero(~graph.fixed)
-    right, diagonal = np.array(right), np.zeros((len(graph), *at_i.shape[1:]))
-    np.add.at(diagonal, c.i, at_i)
-    np.add.at(diagonal, c.j, at_j)
-    to_fixed, from_fixed = graph.fixed[c.j], graph.fixed[c.i]
-    np.add.at(right, c.i[to_fixed], -between[to_fixed] @ known[c.j[to_fixed]])
-    np.add.at(right, c.j[from_fixed], -np.swapaxes(between[from_fixed], 1, 2) @ known[c.i[from_fixed]])
-    factor = factorize(pattern, diagonal[free], between[~(to_fixed | from_fixed)], 0.0)
+    c, held = graph.constraints, graph.fixed[:, None, None] * known
+    diagonal, right = np.zeros((len(graph), *at_i.shape[1:])), np.array(right)
+    _add_blocks(diagonal, c.i, at_i)
+    _add_blocks(diagonal, c.j, at_j)
+    touched = np.flatnonzero(graph.fixed[c.i] | graph.fixed[c.j])
+    i, j, blocks = c.i[touched], c.j[touched], between[touched]
+    _add_blocks(right, i, -blocks @ held[j])
+    _add_blocks(right, j, -np.swapaxes(blocks, 1, 2) @ held[i])
+    factor = factorize(pattern, diagonal, between, 0.0)
     if factor is None:
         raise GraphError("pose graph", "its chordal relaxation is singular", "start from its own poses")
-    result = np.array(known)
-    columns = [solve_factored(pattern, factor, np.ascontiguousarray(right[free, :, k])) for k in range(known.shape[2])]
-    result[free] = np.stack(columns, axis=-1)
-    return result
+    return held + solve_many(pattern, factor, right)
+
+
+@kernel
+def _add_blocks(target: FloatArray, index: IntArray, blocks: FloatArray) -> None:
+    """Do target[index] += blocks, indices repeating: (N, a, b), (E,), (E, a, b)."""
+    for e in range(len(index)):
+        into = target[index[e]]
+        for row in range(blocks.shape[1]):
+            for column in range(blocks.shape[2]):
+                into[row, column] += blocks[e, row, column]

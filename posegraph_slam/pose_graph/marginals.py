@@ -15,11 +15,12 @@ from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import GraphError
 from posegraph_slam.pose_graph.block_cholesky import factorize
 from posegraph_slam.pose_graph.block_inverse import inverse_columns, inverse_diagonal
+from posegraph_slam.pose_graph.block_pattern import BlockPattern
 from posegraph_slam.pose_graph.checks import check_graph
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
+from posegraph_slam.pose_graph.linearization import normal_equations
 from posegraph_slam.pose_graph.noise import symmetrised
-from posegraph_slam.pose_graph.robust import RobustSettings
-from posegraph_slam.pose_graph.sparse_solver import FreeSystem, free_system, linearize
+from posegraph_slam.pose_graph.sparse_solver import free_pattern
 
 COLUMNS_AT_ONCE = 64
 """Nodes whose columns of the covariance are solved for together: bounds memory at 64 p columns of it."""
@@ -30,35 +31,31 @@ class Marginals:
     """A graph factored at its poses, to be asked for covariances many times."""
 
     graph: PoseGraph
-    system: FreeSystem | None
+    pattern: BlockPattern | None
     """None where every node is fixed."""
     factor: FloatArray
-    place: IntArray
-    """Row (N,) of each node among the free ones; meaningless for fixed nodes."""
 
     def covariances(self) -> FloatArray:
         """Return the covariance (N, p, p) of every pose, in the frame of each pose."""
         p = self.graph.group.dof
-        result = np.zeros((len(self.graph), p, p))
-        if self.system is not None:
-            result[self.system.rows] = inverse_diagonal(self.system.pattern, self.factor)
-        return symmetrised(result)
+        if self.pattern is None:
+            return np.zeros((len(self.graph), p, p))
+        return symmetrised(inverse_diagonal(self.pattern, self.factor))
 
     def cross_covariances(self, i: IntArray, j: IntArray) -> FloatArray:
         """Return the covariances (K, p, p) between poses i (rows) and j (columns)."""
         p, fixed = self.graph.group.dof, self.graph.fixed
         result = np.zeros((len(i), p, p))
         pairs = np.flatnonzero(~(fixed[i] | fixed[j]))
-        if self.system is None or len(pairs) == 0:
+        if self.pattern is None or len(pairs) == 0:
             return result
         transposed = len(np.unique(i[pairs])) < len(np.unique(j[pairs]))
         rows, columns = (j[pairs], i[pairs]) if transposed else (i[pairs], j[pairs])
         wanted, which = np.unique(columns, return_inverse=True)
         for begin in range(0, len(wanted), COLUMNS_AT_ONCE):
             now = np.flatnonzero((which >= begin) & (which < begin + COLUMNS_AT_ONCE))
-            part = self.place[wanted[begin : begin + COLUMNS_AT_ONCE]]
-            solved = inverse_columns(self.system.pattern, self.factor, part)
-            blocks = solved[self.place[rows[now]], :, which[now] - begin]
+            solved = inverse_columns(self.pattern, self.factor, wanted[begin : begin + COLUMNS_AT_ONCE])
+            blocks = solved[rows[now], :, which[now] - begin]
             result[pairs[now]] = np.swapaxes(blocks, 1, 2) if transposed else blocks
         return result
 
@@ -84,15 +81,14 @@ def factored_marginals(graph: PoseGraph, *, weights: FloatArray | None = None) -
     check_graph(graph)
     if weights is not None:
         graph = graph.with_constraints(scale_information(graph.constraints, weights))
-    place = np.cumsum(~graph.fixed) - 1
     if graph.fixed.all():
-        return Marginals(graph=graph, system=None, factor=np.zeros(0), place=place)
-    system = free_system(graph)
-    linear = linearize(graph, graph.poses, system, RobustSettings())
-    factor = factorize(system.pattern, linear.diagonal, linear.off_diagonal, 0.0)
+        return Marginals(graph=graph, pattern=None, factor=np.zeros(0))
+    pattern = free_pattern(graph)
+    linear = normal_equations(graph.poses, graph.constraints, np.ones(len(graph.constraints)))
+    factor = factorize(pattern, linear.diagonal, linear.off_diagonal, 0.0)
     if factor is None:
         raise GraphError("marginals", "the graph is singular at its poses", "check weights and information")
-    return Marginals(graph=graph, system=system, factor=factor, place=place)
+    return Marginals(graph=graph, pattern=pattern, factor=factor)
 
 
 def marginal_covariances(graph: PoseGraph, nodes: npt.ArrayLike, *, weights: FloatArray | None = None) -> FloatArray:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pose_graph.checks import check_graph
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
 from posegraph_slam.pose_graph.gtsam_solver import chosen_ordering, run_gtsam
-from posegraph_slam.pose_graph.linearization import jacobians_at, normal_equations, residuals_at, squared_lengths
+from posegraph_slam.pose_graph.linearization import block_decrease, chi2_at, normal_equations
 from posegraph_slam.pose_graph.robust import RobustSettings, constraint_costs, constraint_weights
 from posegraph_slam.pose_graph.solver_settings import (
     EliminationOrdering,
@@ -87,15 +88,13 @@ def possible_decrease(graph: PoseGraph, robust: RobustSettings | None = None) ->
     It is near zero only where the gradient is, is free of units, and so tells an optimum from a stalled solver.
     """
     robust = RobustSettings() if robust is None else robust
-    c, p = graph.constraints, graph.group.dof
-    residuals, by_i, by_j = jacobians_at(graph.poses, c)
-    weights = constraint_weights(c.is_loop, squared_lengths(residuals, c.information), robust)
-    gradient, hessian, _ = normal_equations(
-        len(graph), c.i, c.j, residuals, by_i, by_j, c.information, weights)  # fmt: skip
-    free = ~graph.fixed
-    damping = 1e-12 * np.trace(hessian[free], axis1=1, axis2=2)[:, None, None] * np.eye(p) + 1e-300 * np.eye(p)
-    steps = np.linalg.solve(hessian[free] + damping, gradient[free][..., None])[..., 0]
-    return float(0.5 * np.sum(gradient[free] * steps))
+    return _possible_decrease(graph, chi2_at(graph.poses, graph.constraints), robust)
+
+
+def _possible_decrease(graph: PoseGraph, chi2: FloatArray, robust: RobustSettings) -> float:
+    c = graph.constraints
+    linear = normal_equations(graph.poses, c, constraint_weights(c.is_loop, chi2, robust))
+    return float(block_decrease(linear.gradient, linear.diagonal, ~graph.fixed))
 
 
 def clamp_information(constraints: Constraints, largest: float) -> Constraints:
@@ -145,9 +144,11 @@ def _attempts(graph: PoseGraph, settings: SolverSettings, reason: StopReason) ->
 
 
 def _is_optimum(graph: PoseGraph, run: OptimizerRun, settings: SolverSettings) -> bool:
-    solved = graph.with_poses(run.poses)
-    saved = possible_decrease(solved, settings.robust)
-    return saved <= OPTIMALITY_TOLERANCE * graph_cost(solved, settings.robust) + OPTIMALITY_FLOOR
+    solved, c = graph.with_poses(run.poses), graph.constraints
+    squared = chi2_at(run.poses, c)
+    cost = float(np.sum(constraint_costs(c.is_loop, squared, settings.robust)))
+    saved = _possible_decrease(solved, squared, settings.robust)
+    return saved <= OPTIMALITY_TOLERANCE * cost + OPTIMALITY_FLOOR
 
 
 def _result(
@@ -159,7 +160,7 @@ def _result(
     notes: tuple[str, ...],
 ) -> SolveResult:
     poses = np.where(graph.fixed[:, None, None], graph.poses, run.poses)
-    squared = squared_lengths(residuals_at(poses, graph.constraints), graph.constraints.information)
+    squared = chi2_at(poses, graph.constraints)
     cost = float(np.sum(constraint_costs(graph.constraints.is_loop, squared, settings.robust)))
     reason = run.stop_reason
     if optimal and reason is not StopReason.MAX_ITERATIONS:

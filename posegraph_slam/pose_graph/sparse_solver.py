@@ -7,23 +7,16 @@ from a start to the same optimum. Fixed nodes are left out of the system and so 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
-from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
+from posegraph_slam.arrays import FloatArray
 from posegraph_slam.execution import Progress
 from posegraph_slam.pose_graph.block_cholesky import factorize
 from posegraph_slam.pose_graph.block_pattern import BlockPattern, block_pattern
 from posegraph_slam.pose_graph.block_substitution import solve_factored
 from posegraph_slam.pose_graph.graph import PoseGraph
-from posegraph_slam.pose_graph.linearization import (
-    jacobians_at,
-    moved_poses,
-    normal_equations,
-    residuals_at,
-    squared_lengths,
-)
+from posegraph_slam.pose_graph.linearization import NormalEquations, chi2_at, moved_poses, normal_equations
 from posegraph_slam.pose_graph.robust import RobustSettings, constraint_costs, constraint_weights
 from posegraph_slam.pose_graph.solver_settings import (
     IterationRecord,
@@ -38,96 +31,106 @@ LAMBDA_UPPER_BOUND = 1e5
 LAMBDA_LOWER_BOUND = 1e-14
 LEAST_FIDELITY = 1e-3
 """Smallest share of the predicted decrease that makes a step good."""
+NEAR = 1e-2
+"""Share of the cost that a step saves near the optimum: there the last factor tells what the next step would save."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FreeSystem:
-    """The linear system of a graph's free nodes: their rows (n,), which edges (E,) join two of them, the pattern."""
-
-    rows: IntArray
-    inner: BoolArray
-    pattern: BlockPattern
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Linearized:
-    """Gradient (n, p), diagonal blocks (n, p, p) and off-diagonal blocks of the free nodes."""
-
-    gradient: FloatArray
-    diagonal: FloatArray
-    off_diagonal: FloatArray
-
-
-def free_system(graph: PoseGraph) -> FreeSystem:
-    """Analyse the pattern of a graph's free nodes."""
+def free_pattern(graph: PoseGraph) -> BlockPattern:
+    """Analyse the normal equations of a graph's free nodes, of which there must be one."""
     c = graph.constraints
-    rows = np.flatnonzero(~graph.fixed)
-    place = np.cumsum(~graph.fixed) - 1
-    inner = ~(graph.fixed[c.i] | graph.fixed[c.j])
-    pattern = block_pattern(len(rows), place[c.i[inner]], place[c.j[inner]], graph.group.dof)
-    return FreeSystem(rows=rows, inner=inner, pattern=pattern)
-
-
-def linearize(graph: PoseGraph, poses: FloatArray, system: FreeSystem, robust: RobustSettings) -> Linearized:
-    """Sum up the normal equations of the free nodes at `poses` (N, d+1, d+1), with robust weights on loops."""
-    c = graph.constraints
-    residuals, by_i, by_j = jacobians_at(poses, c)
-    weights = constraint_weights(c.is_loop, squared_lengths(residuals, c.information), robust)
-    gradient, diagonal, off = normal_equations(
-        len(graph), c.i, c.j, residuals, by_i, by_j, c.information, weights)  # fmt: skip
-    return Linearized(gradient=gradient[system.rows], diagonal=diagonal[system.rows], off_diagonal=off[system.inner])
+    return block_pattern(len(graph), c.i, c.j, graph.group.dof, kept=~graph.fixed)
 
 
 def cost_at(graph: PoseGraph, poses: FloatArray, robust: RobustSettings) -> float:
     """Return the cost of a graph at other poses."""
-    c = graph.constraints
-    return float(np.sum(constraint_costs(c.is_loop, squared_lengths(residuals_at(poses, c), c.information), robust)))
+    squared = chi2_at(poses, graph.constraints)
+    return float(np.sum(constraint_costs(graph.constraints.is_loop, squared, robust)))
 
 
 def run_sparse(graph: PoseGraph, settings: SolverSettings, progress: Progress) -> OptimizerRun:
-    """Iterate until the cost stops falling; same meaning as `run_gtsam`. Knows no Dogleg."""
+    """Iterate until the cost stops falling; same meaning as `run_gtsam`. Knows no Dogleg.
+
+    Near the optimum the gradient and the last factor tell what another step would save: often that ends the run one
+    factorisation earlier.
+    """
     begin = time.perf_counter()
     if graph.fixed.all():
         return _nothing_to_do(graph, settings)
-    system, poses, robust = free_system(graph), graph.poses, settings.robust
+    pattern, state = free_pattern(graph), _State(graph, np.array(graph.poses), settings)
     damped = settings.method is SolverMethod.LEVENBERG_MARQUARDT
-    cost, damping = cost_at(graph, poses, robust), settings.lambda_initial if damped else 0.0
-    rows = [(cost, damping, time.perf_counter() - begin)]
+    rows = [(state.cost, state.damping, time.perf_counter() - begin)]
     reason = StopReason.MAX_ITERATIONS
     for iteration in range(settings.max_iterations):
-        step = _step(graph, poses, cost, damping, system, settings)
+        step = _step(graph, state, pattern, settings)
         progress("solve", iteration + 1, settings.max_iterations)
         if step is None:
             reason = StopReason.STALLED if damped else StopReason.DIVERGED
             break
-        before, (poses, cost, damping) = cost, step
-        rows.append((cost, damping, time.perf_counter() - begin))
-        if before - cost <= settings.relative_tolerance * before + settings.absolute_tolerance:
+        before, state = state.cost, step
+        rows.append((state.cost, state.damping, time.perf_counter() - begin))
+        tolerance = settings.relative_tolerance * before + settings.absolute_tolerance
+        if before - state.cost <= tolerance or (
+            before - state.cost <= NEAR * before and state.promised(graph, pattern, settings) <= tolerance
+        ):
             reason = StopReason.CONVERGED
             break
     costs, dampings, seconds = np.array(rows).T
     record = IterationRecord(cost=costs, lambda_=dampings if damped else np.full(len(rows), np.nan), seconds=seconds)
-    return OptimizerRun(poses=poses, stop_reason=reason, record=record)
+    return OptimizerRun(poses=state.poses, stop_reason=reason, record=record)
 
 
-def _step(
-    graph: PoseGraph, poses: FloatArray, cost: float, damping: float, system: FreeSystem, settings: SolverSettings
-) -> tuple[FloatArray, float, float] | None:
-    """Return poses, cost and damping after a step, the old ones if the cost is level, None if no step lowers it."""
-    linear = linearize(graph, poses, system, settings.robust)
+class _State:
+    """Where a solver stands: poses, chi-square of every constraint, cost, damping, and the factor that led there.
+
+    The normal equations are made when first asked for, and kept.
+    """
+
+    def __init__(
+        self,
+        graph: PoseGraph,
+        poses: FloatArray,
+        settings: SolverSettings,
+        damping: float | None = None,
+        factor: FloatArray | None = None,
+    ) -> None:
+        first = settings.lambda_initial if settings.method is SolverMethod.LEVENBERG_MARQUARDT else 0.0
+        self.damping = first if damping is None else damping
+        self.poses, self.factor, self.chi2 = poses, factor, chi2_at(poses, graph.constraints)
+        self.cost = float(np.sum(constraint_costs(graph.constraints.is_loop, self.chi2, settings.robust)))
+        self._linear: NormalEquations | None = None
+
+    def linear(self, graph: PoseGraph, settings: SolverSettings) -> NormalEquations:
+        """Return the normal equations here."""
+        if self._linear is None:
+            c = graph.constraints
+            weights = constraint_weights(c.is_loop, self.chi2, settings.robust)
+            self._linear = normal_equations(self.poses, c, weights)
+        return self._linear
+
+    def promised(self, graph: PoseGraph, pattern: BlockPattern, settings: SolverSettings) -> float:
+        """Return what another step would save, 1/2 g^T H^-1 g, with H from the last step."""
+        if self.factor is None:
+            return np.inf
+        gradient = self.linear(graph, settings).gradient
+        return 0.5 * float(np.sum(gradient * solve_factored(pattern, self.factor, gradient)))
+
+
+def _step(graph: PoseGraph, state: _State, pattern: BlockPattern, settings: SolverSettings) -> _State | None:
+    """Return the state after a step, the old one if the cost is level, None if no step lowers it."""
+    linear, damping, cost = state.linear(graph, settings), state.damping, state.cost
     damped = settings.method is SolverMethod.LEVENBERG_MARQUARDT
     tolerance = settings.relative_tolerance * cost + settings.absolute_tolerance
     while True:
-        factor = factorize(system.pattern, linear.diagonal, linear.off_diagonal, damping)
+        factor = factorize(pattern, linear.diagonal, linear.off_diagonal, damping)
         if factor is not None:
-            delta = -solve_factored(system.pattern, factor, linear.gradient)
-            moved = moved_poses(poses, system.rows, delta)
-            now = cost_at(graph, moved, settings.robust)
+            delta = -solve_factored(pattern, factor, linear.gradient)
+            less = max(damping / LAMBDA_FACTOR, LAMBDA_LOWER_BOUND) if damped else 0.0
+            moved = _State(graph, moved_poses(state.poses, delta), settings, less, factor)
             predicted = 0.5 * float(np.sum(delta * (damping * delta - linear.gradient)))
-            if now < cost and (not damped or cost - now > LEAST_FIDELITY * predicted):
-                return moved, now, max(damping / LAMBDA_FACTOR, LAMBDA_LOWER_BOUND) if damped else 0.0
-            if abs(cost - now) <= tolerance:
-                return (moved, now, damping) if now < cost else (poses, cost, damping)
+            if moved.cost < cost and (not damped or cost - moved.cost > LEAST_FIDELITY * predicted):
+                return moved
+            if abs(cost - moved.cost) <= tolerance:
+                return moved if moved.cost < cost else state
         if not damped or damping * LAMBDA_FACTOR > LAMBDA_UPPER_BOUND:
             return None
         damping *= LAMBDA_FACTOR
