@@ -12,30 +12,34 @@ from posegraph_slam.pose_graph.block_pattern import BlockPattern
 def solve_factored(pattern: BlockPattern, factor: FloatArray, right: FloatArray) -> FloatArray:
     """Solve for the right-hand side (n, p) with a factor of `factorize`; rows that are left out get zero."""
     tree = pattern.elimination
-    x = np.empty((len(pattern.rows), pattern.block))
-    x[tree.position] = right[pattern.rows]
+    x, result = np.empty((len(pattern.rows), pattern.block)), np.zeros((pattern.count, pattern.block))
+    _copy_rows(pattern.rows, tree.position, right, x)
     front = np.empty(pattern.largest_front)
     _substitute(
         pattern.block, tree.start, tree.row_start, tree.rows, pattern.factor_start, factor, x.reshape(-1), front
     )
-    return _whole(pattern, x)
+    _copy_rows(tree.position, pattern.rows, x, result)
+    return result
 
 
 def solve_many(pattern: BlockPattern, factor: FloatArray, right: FloatArray) -> FloatArray:
     """Solve for right-hand sides (n, p, m); rows that are left out get zero."""
-    tree = pattern.elimination
-    x = np.empty((len(pattern.rows), *right.shape[1:]))
-    x[tree.position] = right[pattern.rows]
-    flat = x.reshape(-1, right.shape[2])
+    tree, many = pattern.elimination, right.shape[2]
+    x, result = np.empty((len(pattern.rows), pattern.block * many)), np.zeros(right.shape)
+    _copy_rows(pattern.rows, tree.position, right.reshape(len(right), -1), x)
+    flat = x.reshape(-1, many)
     _substitute_many(pattern.block, tree.start, tree.row_start, tree.rows, pattern.factor_start, factor, flat)
-    return _whole(pattern, x)
-
-
-def _whole(pattern: BlockPattern, x: FloatArray) -> FloatArray:
-    """Return values in the order of elimination as rows of the whole matrix."""
-    result = np.zeros((pattern.count, *x.shape[1:]))
-    result[pattern.rows] = x[pattern.elimination.position]
+    _copy_rows(tree.position, pattern.rows, x, result.reshape(len(right), -1))
     return result
+
+
+@kernel
+def _copy_rows(origin: IntArray, place: IntArray, source: FloatArray, target: FloatArray) -> None:
+    """Do target[place] = source[origin]."""
+    for k in range(len(origin)):
+        from_row, to_row = source[origin[k]], target[place[k]]
+        for m in range(len(from_row)):
+            to_row[m] = from_row[m]
 
 
 @kernel

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pose_graph.checks import check_graph
@@ -46,20 +45,19 @@ def solve(
     """
     settings = SolverSettings() if settings is None else settings
     check_graph(graph)
-    cost_initial = graph_cost(graph, settings.robust)
-    best = _run(graph, settings, progress)
-    best_cost, notes = graph_cost(graph.with_poses(best.poses), settings.robust), []
-    optimal, warm = _is_optimum(graph, best, settings), best.poses
+    best, notes = _run(graph, settings, progress), []
+    cost_initial, best_cost = float(best.record.cost[0]), _cost_of(graph, best, settings)
+    optimal, warm = _is_optimum(graph, best, best_cost, settings), best.poses
     for attempt in _attempts(graph, settings, best.stop_reason) if settings.retry and not optimal else ():
         notes.append(attempt.note)
         if attempt.easier is not None:  # each easier graph starts where the one before ended: a continuation
             warm = _run(attempt.easier.with_poses(warm), attempt.settings, progress).poses
         start = graph.with_poses(best.poses if attempt.easier is None else warm)
         run = _run(start, attempt.settings, progress, orthogonal=attempt.orthogonal)
-        cost = graph_cost(graph.with_poses(run.poses), settings.robust)
+        cost = _cost_of(graph, run, settings)
         if cost < best_cost:
             best, best_cost = run, cost
-            optimal = _is_optimum(graph, best, settings)
+            optimal = _is_optimum(graph, best, best_cost, settings)
         if optimal:
             break
     return _result(graph, settings, cost_initial, best, optimal, tuple(notes))
@@ -87,13 +85,9 @@ def possible_decrease(graph: PoseGraph, robust: RobustSettings | None = None) ->
 
     It is near zero only where the gradient is, is free of units, and so tells an optimum from a stalled solver.
     """
-    robust = RobustSettings() if robust is None else robust
-    return _possible_decrease(graph, chi2_at(graph.poses, graph.constraints), robust)
-
-
-def _possible_decrease(graph: PoseGraph, chi2: FloatArray, robust: RobustSettings) -> float:
     c = graph.constraints
-    linear = normal_equations(graph.poses, c, constraint_weights(c.is_loop, chi2, robust))
+    weights = constraint_weights(c.is_loop, chi2_at(graph.poses, c), RobustSettings() if robust is None else robust)
+    linear = normal_equations(graph.poses, c, weights)
     return float(block_decrease(linear.gradient, linear.diagonal, ~graph.fixed))
 
 
@@ -112,6 +106,10 @@ def _run(graph: PoseGraph, settings: SolverSettings, progress: Progress, *, orth
     if chosen_kind(settings) is SolverKind.SPARSE:
         return run_sparse(graph, settings, progress)
     return run_gtsam(graph, settings, progress, orthogonal=orthogonal)
+
+
+def _cost_of(graph: PoseGraph, run: OptimizerRun, settings: SolverSettings) -> float:
+    return graph_cost(graph.with_poses(run.poses), settings.robust)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -143,11 +141,10 @@ def _attempts(graph: PoseGraph, settings: SolverSettings, reason: StopReason) ->
         yield _Attempt(note="tried GTSAM with QR elimination", settings=gtsam, orthogonal=True)
 
 
-def _is_optimum(graph: PoseGraph, run: OptimizerRun, settings: SolverSettings) -> bool:
-    solved, c = graph.with_poses(run.poses), graph.constraints
-    squared = chi2_at(run.poses, c)
-    cost = float(np.sum(constraint_costs(c.is_loop, squared, settings.robust)))
-    saved = _possible_decrease(solved, squared, settings.robust)
+def _is_optimum(graph: PoseGraph, run: OptimizerRun, cost: float, settings: SolverSettings) -> bool:
+    saved = run.possible_decrease
+    if saved is None:
+        saved = possible_decrease(graph.with_poses(run.poses), settings.robust)
     return saved <= OPTIMALITY_TOLERANCE * cost + OPTIMALITY_FLOOR
 
 

@@ -89,11 +89,15 @@ class IterationRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OptimizerRun:
-    """Best poses (N, d+1, d+1) that an optimiser met, why it stopped, and its record."""
+    """Best poses (N, d+1, d+1) that an optimiser met, why it stopped, and its record.
+
+    `possible_decrease` is the cost that moving each node alone would still save, if the optimiser knows it.
+    """
 
     poses: FloatArray
     stop_reason: StopReason
     record: IterationRecord
+    possible_decrease: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

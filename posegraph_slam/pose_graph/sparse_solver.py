@@ -16,7 +16,13 @@ from posegraph_slam.pose_graph.block_cholesky import factorize
 from posegraph_slam.pose_graph.block_pattern import BlockPattern, block_pattern
 from posegraph_slam.pose_graph.block_substitution import solve_factored
 from posegraph_slam.pose_graph.graph import PoseGraph
-from posegraph_slam.pose_graph.linearization import NormalEquations, chi2_at, moved_poses, normal_equations
+from posegraph_slam.pose_graph.linearization import (
+    NormalEquations,
+    block_decrease,
+    chi2_at,
+    moved_poses,
+    normal_equations,
+)
 from posegraph_slam.pose_graph.robust import RobustSettings, constraint_costs, constraint_weights
 from posegraph_slam.pose_graph.solver_settings import (
     IterationRecord,
@@ -31,8 +37,8 @@ LAMBDA_UPPER_BOUND = 1e5
 LAMBDA_LOWER_BOUND = 1e-14
 LEAST_FIDELITY = 1e-3
 """Smallest share of the predicted decrease that makes a step good."""
-NEAR = 1e-2
-"""Share of the cost that a step saves near the optimum: there the last factor tells what the next step would save."""
+SCREEN = 1e3
+"""A decrease that shrinks as the last one did must come so close to the tolerance for the next to be estimated."""
 
 
 def free_pattern(graph: PoseGraph) -> BlockPattern:
@@ -50,7 +56,7 @@ def cost_at(graph: PoseGraph, poses: FloatArray, robust: RobustSettings) -> floa
 def run_sparse(graph: PoseGraph, settings: SolverSettings, progress: Progress) -> OptimizerRun:
     """Iterate until the cost stops falling; same meaning as `run_gtsam`. Knows no Dogleg.
 
-    Near the optimum the gradient and the last factor tell what another step would save: often that ends the run one
+    Near the optimum the gradient and the last factor tell what another step would save: that ends most runs one
     factorisation earlier.
     """
     begin = time.perf_counter()
@@ -59,24 +65,24 @@ def run_sparse(graph: PoseGraph, settings: SolverSettings, progress: Progress) -
     pattern, state = free_pattern(graph), _State(graph, np.array(graph.poses), settings)
     damped = settings.method is SolverMethod.LEVENBERG_MARQUARDT
     rows = [(state.cost, state.damping, time.perf_counter() - begin)]
-    reason = StopReason.MAX_ITERATIONS
+    reason, gain = StopReason.MAX_ITERATIONS, np.inf
     for iteration in range(settings.max_iterations):
         step = _step(graph, state, pattern, settings)
         progress("solve", iteration + 1, settings.max_iterations)
         if step is None:
             reason = StopReason.STALLED if damped else StopReason.DIVERGED
             break
-        before, state = state.cost, step
+        before, last, state = state.cost, gain, step
         rows.append((state.cost, state.damping, time.perf_counter() - begin))
-        tolerance = settings.relative_tolerance * before + settings.absolute_tolerance
-        if before - state.cost <= tolerance or (
-            before - state.cost <= NEAR * before and state.promised(graph, pattern, settings) <= tolerance
-        ):
+        gain, tolerance = before - state.cost, settings.relative_tolerance * before + settings.absolute_tolerance
+        near = gain * (gain / last if gain < last < np.inf else 1.0) <= SCREEN * tolerance
+        if gain <= tolerance or (near and state.promised(graph, pattern, settings) <= tolerance):
             reason = StopReason.CONVERGED
             break
     costs, dampings, seconds = np.array(rows).T
     record = IterationRecord(cost=costs, lambda_=dampings if damped else np.full(len(rows), np.nan), seconds=seconds)
-    return OptimizerRun(poses=state.poses, stop_reason=reason, record=record)
+    left = state.possible_decrease(graph, settings) if reason is StopReason.CONVERGED else None
+    return OptimizerRun(poses=state.poses, stop_reason=reason, record=record, possible_decrease=left)
 
 
 class _State:
@@ -113,6 +119,11 @@ class _State:
             return np.inf
         gradient = self.linear(graph, settings).gradient
         return 0.5 * float(np.sum(gradient * solve_factored(pattern, self.factor, gradient)))
+
+    def possible_decrease(self, graph: PoseGraph, settings: SolverSettings) -> float:
+        """Return what moving each node alone would save, to first order."""
+        linear = self.linear(graph, settings)
+        return float(block_decrease(linear.gradient, linear.diagonal, ~graph.fixed))
 
 
 def _step(graph: PoseGraph, state: _State, pattern: BlockPattern, settings: SolverSettings) -> _State | None:

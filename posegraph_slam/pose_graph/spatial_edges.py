@@ -126,7 +126,7 @@ def spatial_equations(poses: FloatArray, i: IntArray, j: IntArray, T: FloatArray
                       weights: FloatArray, gradient: FloatArray, diagonal: FloatArray,
                       off: FloatArray) -> None:  # fmt: skip
     """Add to gradient (N, 6) and diagonal blocks (N, 6, 6), write the blocks (i, j) (E, 6, 6)."""
-    now, work, squares = np.empty((3, 4)), np.empty((3, 4)), np.empty((4, 3, 3))
+    now, work, squares = np.empty((3, 4)), np.empty((3, 4)), np.empty((2, 3, 3))
     J, N, residual, pull, g = np.empty((3, 3)), np.empty((3, 3)), np.empty(SIZE), np.empty(SIZE), np.empty(SIZE)
     V, H, M = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE))
     for e in range(len(i)):

@@ -19,13 +19,6 @@ def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 
 @kernel
-def _hat(v: FloatArray, out: FloatArray) -> None:
-    out[0, 0], out[1, 1], out[2, 2] = 0.0, 0.0, 0.0
-    out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
-    out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]
-
-
-@kernel
 def spatial_between(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Write the upper three rows of a^-1 b."""
     for r in range(3):
@@ -88,53 +81,50 @@ def spatial_error(now: FloatArray, z: FloatArray, work: FloatArray, residual: Fl
 
 
 @kernel
-def _mixed_jacobian(phi: FloatArray, rho: FloatArray, K: FloatArray, P: FloatArray, M: FloatArray, N: FloatArray,
-                    Q: FloatArray) -> None:  # fmt: skip
-    """Write Q of Barfoot (2017, eq. 7.86) for (-phi, -rho); K, P, M, N (3, 3) are overwritten."""
-    square = phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2
+def _mixed_coefficients(square: float) -> tuple[float, float, float]:
+    """Return (a - sin a)/a^3, (1 - a^2/2 - cos a)/a^4 and (2a - 3 sin a + a cos a)/(2 a^5) for a^2 = square."""
     if square < SMALL_SQUARE:
-        c2 = 1.0 / 6.0 + square * (-1.0 / 120.0 + square * (1.0 / 5040.0 - square / 362880.0))
-        c3 = -1.0 / 24.0 + square * (1.0 / 720.0 + square * (-1.0 / 40320.0 + square / 3628800.0))
-        c4 = 1.0 / 120.0 + square * (-1.0 / 2520.0 + square * (1.0 / 120960.0 - square / 9979200.0))
-    else:
-        a = np.sqrt(square)
-        sine, cosine = np.sin(a), np.cos(a)
-        c2 = (a - sine) / (a * square)
-        c3 = (1.0 - 0.5 * square - cosine) / (square * square)
-        c4 = (2.0 * a - 3.0 * sine + a * cosine) / (2.0 * square * square * a)
-    for k in range(3):
-        phi[k], rho[k] = -phi[k], -rho[k]
-    _hat(phi, K)
-    _hat(rho, P)
-    for k in range(3):
-        phi[k], rho[k] = -phi[k], -rho[k]
-    _product(K, P, M)  # KP; PK = (KP)^T since both are skew
-    _product(M, K, N)  # KPK
-    for r in range(3):
-        for c in range(3):
-            Q[r, c] = 0.5 * P[r, c] + c2 * (M[r, c] + M[c, r] + N[r, c]) + 3.0 * c3 * N[r, c]
-    for r in range(3):
-        for c in range(3):
-            kkp, pkk = 0.0, 0.0
-            kpkk, kkpk = 0.0, 0.0
-            for k in range(3):
-                kkp += K[r, k] * M[k, c]
-                pkk += M[k, r] * K[k, c]
-                kpkk += N[r, k] * K[k, c]
-                kkpk += K[r, k] * N[k, c]
-            Q[r, c] += -c3 * (kkp + pkk) + c4 * (kpkk + kkpk)
+        return (
+            1.0 / 6.0 + square * (-1.0 / 120.0 + square * (1.0 / 5040.0 - square / 362880.0)),
+            -1.0 / 24.0 + square * (1.0 / 720.0 + square * (-1.0 / 40320.0 + square / 3628800.0)),
+            1.0 / 120.0 + square * (-1.0 / 2520.0 + square * (1.0 / 120960.0 - square / 9979200.0)),
+        )
+    a = np.sqrt(square)
+    sine, cosine = np.sin(a), np.cos(a)
+    return (
+        (a - sine) / (a * square),
+        (1.0 - 0.5 * square - cosine) / (square * square),
+        (2.0 * a - 3.0 * sine + a * cosine) / (2.0 * square * square * a),
+    )
 
 
 @kernel
 def inverse_right_jacobian(phi: FloatArray, rho: FloatArray, J: FloatArray, N: FloatArray, work: FloatArray) -> None:
-    """Write J and N (3, 3) of Jr^-1 = [[J, 0], [-N, J]], N = J Q J, at (phi, rho); `work` (4, 3, 3) is overwritten."""
-    K, P, M, Q = work[0], work[1], work[2], work[3]
-    _mixed_jacobian(phi, rho, K, P, M, N, Q)
-    _hat(phi, K)
-    _product(K, K, M)
-    k = _inverse_coefficient(phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2)
+    """Write J and N = J Q J (3, 3) of Jr^-1 = [[J, 0], [-N, J]] at (phi, rho); `work` (2, 3, 3) is overwritten.
+
+    Q is that of Barfoot (2017, eq. 7.86) at (-phi, -rho). With K = hat(phi), P = hat(rho), s = phi.rho its products
+    fold: KP + PK = phi rho^T + rho phi^T - 2s, KPK = -s K, KKP + PKK = -s K - phi^2 P and KPKK = -s K^2.
+    """
+    square = phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2
+    s = phi[0] * rho[0] + phi[1] * rho[1] + phi[2] * rho[2]
+    c2, c3, c4 = _mixed_coefficients(square)
+    k = _inverse_coefficient(square)
+    by_shift, by_turn, by_square = -(0.5 + c3 * square), s * (c2 + 2.0 * c3), -2.0 * c4 * s
+    level = -2.0 * c2 * s - by_square * square
+    Q, M = work[0], work[1]
     for r in range(3):
         for c in range(3):
-            J[r, c] = (1.0 if r == c else 0.0) + 0.5 * K[r, c] + k * M[r, c]
+            outer = phi[r] * phi[c]
+            Q[r, c] = c2 * (phi[r] * rho[c] + rho[r] * phi[c]) + by_square * outer
+            J[r, c] = k * outer
+        Q[r, r] += level
+        J[r, r] += 1.0 - k * square
+    for r in range(3):
+        m, n = (r + 1) % 3, (r + 2) % 3
+        skew = by_shift * rho[r] + by_turn * phi[r]
+        Q[n, m] += skew
+        Q[m, n] -= skew
+        J[n, m] += 0.5 * phi[r]
+        J[m, n] -= 0.5 * phi[r]
     _product(J, Q, M)
     _product(M, J, N)
