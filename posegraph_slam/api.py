@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from posegraph_slam.datasets.registry import read as read_log
-from posegraph_slam.datasets.tum import read_tum
+from posegraph_slam.datasets.trajectory_files import read_trajectory
 from posegraph_slam.evaluation.tables import ComparisonTable
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.geometry import Trajectory
@@ -133,8 +133,8 @@ def optimize(
     """Find the trajectory of a robot and its maps in a log, given as such or by its path.
 
     `config` changes the defaults: a dict of keys (`{"mapping.resolution_m": 0.1}` or nested), the name of a preset, a
-    TOML file, or a whole `Configuration`; `seed` and `workers` win over it. `truth` are true body poses (a TUM file or
-    a trajectory) that replace the log's own. Results do not depend on `workers` (0: one a core). Raises
+    TOML file, or a whole `Configuration`; `seed` and `workers` win over it. `truth` are true body poses (a file or a
+    trajectory) that replace the log's own. Results do not depend on `workers` (0: one a core). Raises
     ConfigurationError for a key that is unknown or out of range, InputError for a log that cannot be used.
     """
     configuration = resolve_configuration(config, seed=seed, workers=workers)
@@ -143,7 +143,7 @@ def optimize(
         with clock.stage("reading"):
             robot_log = log if isinstance(log, RobotLog) else read_log(log)
             if truth is not None:
-                known = truth if isinstance(truth, Trajectory) else read_tum(truth, parent="ref", child="base")
+                known = truth if isinstance(truth, Trajectory) else read_trajectory(truth)
                 robot_log = dataclasses.replace(robot_log, truth=known)
         with open_executor(usable_workers(configuration)) as executor:
             result = optimize_log(robot_log, configuration, progress=progress, executor=executor)

@@ -15,6 +15,7 @@ from posegraph_slam.cli import (
     alignment,
     attitude,
     configuration,
+    conversion,
     datasets,
     inspection,
     localization,
@@ -97,6 +98,7 @@ app.command("localize", short_help="Find the robot in a known map at every scan.
 app.command("pf-slam", short_help="Map a log with a particle filter.")(particle_slam.pf_slam)
 app.command("simulate", short_help="Write a simulated log with its truth.")(simulation.simulate)
 app.command("attitude", short_help="Estimate orientation from an IMU.")(attitude.attitude)
+app.command("convert", short_help="Write a trajectory or log in another format.")(conversion.convert)
 app.command("datasets", short_help="List the formats that can be read.")(datasets.datasets)
 app.add_typer(configuration.app, name="config", short_help="List presets, show the configuration.")
 

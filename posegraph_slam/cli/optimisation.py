@@ -33,7 +33,7 @@ def optimize(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run directory; default: runs/NAME OF LOG.")] = None,
     config: Config = None,
     settings: Set = None,
-    truth: Annotated[Path | None, typer.Option("--truth", help="TUM file of true poses to compare with.")] = None,
+    truth: Annotated[Path | None, typer.Option("--truth", help="File of true poses: TUM, KITTI, EuRoC or CSV.")] = None,
     log_format: Format = None,
     topic: Topic = None,
     seed: Seed = None,

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.arrays import read_only
+from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.datasets.coverage import uneven_coverage
 from posegraph_slam.datasets.ece276a_frames import find_frames
 from posegraph_slam.datasets.npz import Archive
@@ -109,7 +109,7 @@ def _encoders(archive: Archive) -> WheelEncoders:
         stamps_s=stamps,
         ticks_right=ticks[[0, 2]].T,
         ticks_left=ticks[[1, 3]].T,
-        metres_per_tick=METRES_PER_TICK,
+        metres_per_tick=archive.scalar("metres_per_tick") if "metres_per_tick" in archive else METRES_PER_TICK,
         track_width_m=archive.scalar("track_width_m") if "track_width_m" in archive else TRACK_WIDTH_M,
     )
 
@@ -150,8 +150,15 @@ def _scans(archive: Archive, remarks: list[str]) -> LaserScans:
         angle_increment_rad=step,
         range_min_m=nearest,
         range_max_m=farthest,
-        T_base_lidar=T_BASE_LIDAR,
+        T_base_lidar=_mounting(archive) if "T_base_lidar" in archive else T_BASE_LIDAR,
     )
+
+
+def _mounting(archive: Archive) -> FloatArray:
+    T = np.asarray(archive.numbers("T_base_lidar"), dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+        raise InputError(archive.path, f"field 'T_base_lidar' {T.shape} is no pose", "give a 4 x 4 transform, or none")
+    return T
 
 
 def _rgbd(archive: Archive, run: str, remarks: list[str]) -> RgbdFrames:

@@ -92,6 +92,11 @@ BUILT_IN = (
         "hand-held IMU board, raw ADC counts, with motion-capture truth where it is known (ESE650, ECE276A)",
         "an .npz file with imu_raw and imu_stamps_s and, when present, vicon_rotation and vicon_stamps_s",
     ),
+    _built_in(
+        "euroc",
+        "IMU and true poses of a EuRoC recording (ASL format); its cameras are not read",
+        "the folder that holds mav0, mav0 itself, or the data.csv of an imu0",
+    ),
 )
 
 
@@ -141,6 +146,11 @@ def read(
     if reader.read_topics is None:
         raise InputError("--topic", f"a {reader.name} log has no topics to choose", "leave the option out")
     return reader.read_topics(path, topics)
+
+
+def recognised(path: Path) -> bool:
+    """Tell whether some reader recognises the log at `path`."""
+    return any(reader.detects(path) for reader in available_readers())
 
 
 def _named(name: str, readers: tuple[Reader, ...]) -> Reader:

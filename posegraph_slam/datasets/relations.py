@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from posegraph_slam.datasets.number_text import read_table, refuse_first
+from posegraph_slam.files import replacing
 from posegraph_slam.geometry import Relations, pose_from_rotation_translation
 
 COLUMNS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
@@ -26,3 +27,14 @@ def read_relations(path: str | Path) -> Relations:
     return Relations(
         stamps_1_s=values[:, 0], stamps_2_s=values[:, 1], T_1_2=pose_from_rotation_translation(R, values[:, 2:5])
     )
+
+
+def write_relations(relations: Relations, path: str | Path) -> None:
+    """Write true poses in the form that `read_relations` reads; numbers read back as they are."""
+    rpy = Rotation.from_matrix(relations.T_1_2[:, :3, :3]).as_euler("xyz")
+    values = (np.column_stack([relations.T_1_2[:, :3, 3], rpy]) + 0.0).tolist()
+    stamps = zip(relations.stamps_1_s.tolist(), relations.stamps_2_s.tolist(), strict=True)
+    with replacing(Path(path)) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+        file.write(f"# {' '.join(COLUMNS)}\n")
+        for (first, second), row in zip(stamps, values, strict=True):
+            file.write(f"{first!r} {second!r} {' '.join(map(repr, row))}\n")

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from posegraph_slam.datasets.tum import read_tum
+from posegraph_slam.datasets.trajectory_files import read_trajectory
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pipeline.configuration import Configuration, usable_workers
 from posegraph_slam.pipeline.executors import open_executor
@@ -39,9 +39,9 @@ def run(
 ) -> RunSummary:
     """Optimise the log at `log_path` and leave everything in the run directory `out`.
 
-    `truth` names a TUM file of true body poses that replaces the log's own; `matching_of` a run directory of the same
-    log whose scan matching is taken over. `out` appears when all is written; an
-    error leaves nothing. Raises InputError where `out` is taken or the log cannot be used.
+    `truth` names a file of true body poses (TUM, KITTI, EuRoC, CSV) that replaces the log's own; `matching_of` a run
+    directory of the same log whose scan matching is taken over; `topics` those of a bag. `out` appears when all is
+    written; an error leaves nothing. Raises InputError where `out` is taken or the log cannot be used.
     """
     with recorded_run(
         log_path,
@@ -57,7 +57,7 @@ def run(
         matched = None
         with clock.stage("reading"):
             if truth is not None:
-                log = dataclasses.replace(log, truth=read_tum(truth, parent="ref", child="base"))
+                log = dataclasses.replace(log, truth=read_trajectory(truth))
             if matching_of is not None and log.scans is not None:
                 matched = read_matching(read_run_directory(matching_of).path(MATCHING), len(log.scans))
         with open_executor(usable_workers(configuration)) as executor:

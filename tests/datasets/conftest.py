@@ -108,6 +108,25 @@ def write_imu_vicon(path: Path, samples: int = 300) -> Path:
     return path
 
 
+def write_euroc(folder: Path, samples: int = 50) -> Path:
+    """Write the IMU and true poses of a sequence."""
+    imu, truth = (folder / "mav0" / name for name in ("imu0", "state_groundtruth_estimate0"))
+    imu.mkdir(parents=True)
+    truth.mkdir()
+    stamps = [1_403_636_579_758_555_392 + 5_000_000 * k for k in range(samples)]
+    quantities = (("w_RS_S", "rad s^-1"), ("a_RS_S", "m s^-2"))
+    columns = ",".join(f"{name}_{axis} [{unit}]" for name, unit in quantities for axis in "xyz")
+    rows = [f"{stamp},{0.01 * k:.12f},-0.2,0.3,0.5,0.125,9.81" for k, stamp in enumerate(stamps)]
+    (imu / "data.csv").write_text("\n".join([f"#timestamp [ns],{columns}", *rows]) + "\n")
+    (imu / "sensor.yaml").write_text(
+        "sensor_type: imu\nT_BS:\n  cols: 4\n  rows: 4\n  data: [0.0, -1.0, 0.0, 0.1,\n         1.0, 0.0, 0.0, 0.2,\n"
+        "         0.0, 0.0, 1.0, 0.3,\n         0.0, 0.0, 0.0, 1.0]\n"
+    )
+    poses = [f"{stamp},{0.1 * k},0,1,1,0,0,0,0.5,0,0,0,0,0,0,0,0" for k, stamp in enumerate(stamps)]
+    (truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], and more\n" + "\n".join(poses) + "\n")
+    return folder
+
+
 def build(name: str, folder: Path) -> Path:
     """Write a small log of the format called `name`."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -116,6 +135,7 @@ def build(name: str, folder: Path) -> Path:
         "carmen": lambda: write_carmen(folder / "log.clf"),
         "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
         "rosbag": lambda: store_as("ros1", folder, robot(maker_of("ros1"))),
+        "euroc": lambda: write_euroc(folder / "sequence"),
         "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
     }[name]()
 
@@ -128,9 +148,12 @@ def build_truncated(name: str, folder: Path) -> tuple[Path, Path]:
         "carmen": lambda: write_carmen(folder / "log.clf.gz"),
         "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
         "rosbag": lambda: store_as("ros1", folder, robot(maker_of("ros1"))),
+        "euroc": lambda: write_euroc(folder / "sequence"),
         "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
     }[name]()
-    file = path / "Hokuyo7.npz" if path.is_dir() else path
+    file = path
+    if path.is_dir():
+        file = path / ("mav0/imu0/data.csv" if name == "euroc" else "Hokuyo7.npz")
     file.write_bytes(file.read_bytes()[:-100])
     return path, file
 

@@ -17,7 +17,7 @@ from posegraph_slam.errors import InputError
 from posegraph_slam.sensors import RobotLog
 
 every_reader = pytest.mark.parametrize("reader", BUILT_IN, ids=lambda reader: reader.name)
-WITHOUT_SCANS = {"imu_vicon"}
+WITHOUT_SCANS = {"imu_vicon", "euroc"}
 Builder = Callable[[str, Path], Path]
 
 

@@ -38,7 +38,15 @@ def entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_another_package_adds_a_reader_and_a_broken_one_is_left_out(entry_points: None, tmp_path: Path) -> None:
     with pytest.warns(RuntimeWarning) as caught:
         readers = datasets.available_readers()
-    assert [reader.name for reader in readers] == ["ece276a", "carmen", "rosbag", "humanoid", "imu_vicon", "other"]
+    assert [reader.name for reader in readers] == [
+        "ece276a",
+        "carmen",
+        "rosbag",
+        "humanoid",
+        "imu_vicon",
+        "euroc",
+        "other",
+    ]
     messages = " ".join(str(warning.message) for warning in caught)
     assert "'carmen' exists" in messages
     assert "make_reader is not a posegraph_slam Reader" in messages
