@@ -76,9 +76,14 @@ def read(path: str | Path) -> RobotLog:
     index = joints.nearest(stamps)
     T_base_lidar = lidar_on_level_body(joints.neck_yaw_rad[index], joints.head_pitch_rad[index], rpy[:, 0], rpy[:, 1])
     angles = resolution * (np.arange(ranges.shape[1]) - (ranges.shape[1] - 1) / 2)
-    level, dropped = level_ranges(
-        ranges.astype(np.float32), angles, T_base_lidar, GROUND_M, np.array([RANGE_MIN_M, RANGE_MAX_M])
+    levelled = level_ranges(
+        ranges.astype(np.float32),
+        angles,
+        T_base_lidar,
+        heights_m=(GROUND_M, np.inf),
+        limits_m=np.array([RANGE_MIN_M, RANGE_MAX_M]),
     )
+    level, dropped = levelled.ranges_m, levelled.too_low
     scans = LaserScans(
         stamps_s=stamps,
         ranges_m=level,

@@ -32,7 +32,7 @@ def odometry_at_scans(log: RobotLog, settings: OdometrySettings | None = None) -
         return _logged(log, stamps, settings)
     assert log.encoders is not None
     imu = log.imu if source == "wheels_imu" else None
-    return _at_stamps(wheel_imu_odometry(log.encoders, imu, settings), stamps, settings)
+    return resample_at_scans(wheel_imu_odometry(log.encoders, imu, settings), stamps, settings)
 
 
 def chosen_source(log: RobotLog, wanted: OdometrySource = "auto") -> OdometrySource:
@@ -66,7 +66,7 @@ def _logged(log: RobotLog, stamps: FloatArray, settings: OdometrySettings) -> Od
             raise InputError(log.path, f"{len(log.scan_odometry)} odometry poses for {len(stamps)} scans")
         return _from_poses(log, log.scan_odometry.restamped(stamps), settings)
     assert log.odometry is not None
-    return _at_stamps(_from_poses(log, log.odometry.in_stamp_order(), settings), stamps, settings)
+    return resample_at_scans(_from_poses(log, log.odometry.in_stamp_order(), settings), stamps, settings)
 
 
 def _from_poses(log: RobotLog, trajectory: Trajectory, settings: OdometrySettings) -> OdometryEstimate:
@@ -89,7 +89,7 @@ def _from_poses(log: RobotLog, trajectory: Trajectory, settings: OdometrySetting
     )
 
 
-def _at_stamps(estimate: OdometryEstimate, stamps: FloatArray, settings: OdometrySettings) -> OdometryEstimate:
+def resample_at_scans(estimate: OdometryEstimate, stamps: FloatArray, settings: OdometrySettings) -> OdometryEstimate:
     """Resample at the scan stamps and remark on scans outside the odometry's time."""
     known = estimate.trajectory.stamps_s
     floor = settings.wheels_imu_noise if estimate.source == "wheels_imu" else settings.wheels_noise

@@ -12,6 +12,7 @@ from posegraph_slam.odometry.estimate import OdometryEstimate, diagonal_covarian
 from posegraph_slam.odometry.gyro_bias import GyroBias, estimate_gyro_bias, runs, yaw_rate
 from posegraph_slam.odometry.gyro_integral import integrate_rate
 from posegraph_slam.odometry.settings import OdometrySettings
+from posegraph_slam.odometry.tilt import Tilt
 from posegraph_slam.odometry.track_width import estimate_track_width
 from posegraph_slam.sensors import Imu, WheelEncoders
 
@@ -20,13 +21,15 @@ COVERED = 1 - 1e-6
 
 
 def wheel_imu_odometry(
-    encoders: WheelEncoders, imu: Imu | None, settings: OdometrySettings | None = None
+    encoders: WheelEncoders, imu: Imu | None, settings: OdometrySettings | None = None, *, tilt: Tilt | None = None
 ) -> OdometryEstimate:
     """Integrate wheel travel and yaw rate into poses at the encoder stamps, the first one the identity.
 
     Over each encoder interval the distance is the mean travel of the two sides and the turn the exact integral of the
     gyro (linear between its samples, bias removed). Where the gyro is missing (late start, gap, early end, no IMU) the
-    wheels' difference over the effective track width turns instead, for just that part of the interval.
+    wheels' difference over the effective track width turns instead, for just that part of the interval. With `tilt` at
+    the IMU's stamps the poses are the plan view of a drive over slopes: headings turn about the vertical, and the way
+    is its horizontal part.
     Raises InputError on empty streams, stamps that run backwards and values that are not finite.
     """
     settings = settings or OdometrySettings()
@@ -39,11 +42,16 @@ def wheel_imu_odometry(
     stamps = encoders.stamps_s - epoch
     travel, duration = encoders.travel_m[1:], np.diff(stamps)
     bias = estimate_gyro_bias(encoders, imu, settings.gyro_bias)
-    gyro = integrate_rate(imu.stamps_s - epoch, yaw_rate(imu) - bias.rad_s, max_gap_s=settings.max_imu_gap_s)
+    rate = yaw_rate(imu) - bias.rad_s
+    if tilt is not None:
+        rate = tilt.heading_rate(rate, imu)
+    gyro = integrate_rate(imu.stamps_s - epoch, rate, max_gap_s=settings.max_imu_gap_s)
     angle, covered_s = (np.diff(values) for values in gyro.at(stamps))
     covered = np.divide(covered_s, duration, out=np.zeros_like(duration), where=duration > 0)
     covered = np.where(covered > COVERED, 1.0, covered)
     distance, difference = wheel_distance(travel), wheel_difference(travel)
+    if tilt is not None:
+        distance = distance * tilt.at(encoders.stamps_s[1:] - 0.5 * duration)[:, 0, 0]
     full = covered == 1.0
     width = estimate_track_width(stamps[1:][full], difference[full], angle[full], nominal_m=encoders.track_width_m)
     turn = angle + (1 - covered) * difference / width.metres

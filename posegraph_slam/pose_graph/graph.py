@@ -28,11 +28,19 @@ class ConstraintKind(IntEnum):
     """Registration of a pair that overlaps in the optimised map."""
     EXTERNAL = 7
     """Read from a graph file."""
+    ATTITUDE = 8
+    """Roll and pitch of a node, relative to a fixed one; all else is left free."""
+    SAME_GROUND = 9
+    """Two nodes stand at one place at the same height."""
 
     @property
     def is_loop(self) -> bool:
         """Whether the constraint closes a loop, so that it may be wrong as a whole."""
-        return self not in (ConstraintKind.ODOMETRY, ConstraintKind.SCAN_MATCHING)
+        return self not in CERTAIN_KINDS
+
+
+CERTAIN_KINDS = (ConstraintKind.ODOMETRY, ConstraintKind.SCAN_MATCHING, ConstraintKind.ATTITUDE)
+"""Kinds of constraints that are never wrong as a whole, so that no robust loss applies to them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,7 +72,7 @@ class Constraints:
     @property
     def is_loop(self) -> BoolArray:
         """Which constraints (E,) close loops."""
-        return self.kind > int(ConstraintKind.SCAN_MATCHING)
+        return ~np.isin(self.kind, [int(kind) for kind in CERTAIN_KINDS])
 
     def select(self, index: IntArray | BoolArray) -> Constraints:
         """Return the constraints at `index`."""

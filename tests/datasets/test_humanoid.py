@@ -88,7 +88,8 @@ def test_a_level_laser_on_the_axis_keeps_its_ranges() -> None:
     ranges = (2.0 / np.maximum(np.cos(angles), 0.25)).astype(np.float32)[None]
     pose = np.eye(4)[None].copy()
     pose[0, 2, 3] = 1.0
-    level, dropped = level_ranges(ranges, angles, pose, 0.1, np.array([0.1, 30.0]))
+    levelled = level_ranges(ranges, angles, pose, heights_m=(0.1, np.inf), limits_m=np.array([0.1, 30.0]))
+    level, dropped = levelled.ranges_m, levelled.too_low
     assert dropped == 0
     np.testing.assert_allclose(level[0, 90:271], ranges[0], rtol=1e-5)
     assert (level[0, :90] == 0).all()

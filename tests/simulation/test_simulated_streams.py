@@ -15,12 +15,18 @@ from posegraph_slam.datasets.simulation import (
 )
 from posegraph_slam.datasets.simulation.raycast import cast_scans
 from posegraph_slam.datasets.simulation.streams import lidar_increment, lidar_poses
+from posegraph_slam.geometry import xyt_from_pose
 from posegraph_slam.sensors import STANDARD_GRAVITY
 
 EXACT = {
     "encoders": EncoderSettings(sigma_scale=0, sigma_slip_m=0),
     "imu": ImuSettings(
-        sigma_bias_rad_s=0, sigma_gyro_rad_s=0, sigma_scale=0, sigma_walk_rad_s=0, sigma_accelerometer_g=0
+        sigma_bias_rad_s=0,
+        sigma_gyro_rad_s=0,
+        sigma_scale=0,
+        sigma_walk_rad_s=0,
+        sigma_accelerometer_g=0,
+        sigma_accelerometer_bias_g=0,
     ),
     "lidar": LidarSettings(beams=61, rate_hz=5, sigma_range_m=0, dropout_rate=0, no_return_rate=0),
 }
@@ -88,7 +94,7 @@ def test_ranges_have_the_noise_and_the_losses_asked_for():
     settings = tiny_settings(duration_s=40.0)
     run = simulate_run(settings)
     fan = np.array([-2.356194490192345, lidar_increment(settings.lidar)])
-    poses = lidar_poses(run.motion, run.lidar_times_s, settings.lidar)
+    poses = xyt_from_pose(lidar_poses(run.motion, run.lidar_times_s, settings.lidar))
     exact = cast_scans(poses, fan, 361, run.world.segments, run.world.circles)
     lost, no_return = run.ranges_m == np.float32(0.001), run.ranges_m == 60
     assert abs(lost.mean() - settings.lidar.dropout_rate) < 0.002

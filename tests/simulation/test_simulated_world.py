@@ -19,6 +19,7 @@ from posegraph_slam.datasets.simulation.raycast import cast_scans
 from posegraph_slam.datasets.simulation.route import plan_path
 from posegraph_slam.datasets.simulation.run import generator
 from posegraph_slam.datasets.simulation.streams import lidar_poses
+from posegraph_slam.geometry import xyt_from_pose
 from posegraph_slam.datasets.simulation.world import build_world
 
 
@@ -66,7 +67,7 @@ def test_sectors_of_a_still_sweep_equal_one_scan():
 
 def test_no_beam_passes_a_wall():
     run = simulate_run(tiny_settings(duration_s=30.0))
-    poses = lidar_poses(run.motion, run.lidar_times_s[::15], run.settings.lidar)[:, 0]
+    poses = xyt_from_pose(lidar_poses(run.motion, run.lidar_times_s[::15], run.settings.lidar)[:, 0])
     bearings = np.linspace(-2.356194490192345, 2.356194490192345, 361)
     ranges = run.ranges_m[::15].astype(np.float64)
     hit = ranges < 30

@@ -133,6 +133,11 @@ def _write_world(run: SimulatedRun, floor: FloorTexture | None, folder: Path) ->
         "circles_x_y_radius": np.round(run.world.circles, 6).tolist(),
         "settings": run.settings.model_dump(mode="json"),
     }
+    if run.world.terrain is not None:
+        terrain = run.world.terrain
+        content["ground_xa_xb_ya_yb_z_rise"] = np.round(terrain.patches, 6).tolist()
+        content["obstacles_top_m"] = np.round(terrain.spans_m[:, 1], 6).tolist()
+        content["ceiling_m"] = terrain.ceiling_m
     if floor is not None:
         content["floor"] = {
             "file": "floor.png",

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, read_only
-from posegraph_slam.datasets.simulation.route import STEP_M, Path
+from posegraph_slam.datasets.simulation.route import STEP_M, Path, rotation_on_ground
 from posegraph_slam.datasets.simulation.settings import DriveSettings
-from posegraph_slam.geometry import pose_from_xyt
+from posegraph_slam.geometry import pose_from_rotation_translation, pose_from_xyt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,6 +41,10 @@ class Motion:
         """Heading (n,), unwrapped, at times since the begin."""
         return np.interp(self.distance_at(times_s), self.path.distance_m, self.path.heading_rad)
 
+    def turn_at(self, times_s: FloatArray) -> FloatArray:
+        """Turn (n,) about the robot's own vertical axis since the begin, unwrapped."""
+        return np.interp(self.distance_at(times_s), self.path.distance_m, self.path.turn_rad)
+
     def xyt_at(self, times_s: FloatArray) -> FloatArray:
         """Planar pose (n, 3) [x, y, heading] of the base in the world at times since the begin."""
         distance = self.distance_at(times_s)
@@ -48,8 +52,17 @@ class Motion:
         return np.stack([np.interp(distance, self.path.distance_m, column) for column in columns], axis=-1)
 
     def poses_at(self, times_s: FloatArray) -> FloatArray:
-        """T_world_base (n, 3, 3) at times since the begin."""
+        """T_world_base (n, 3, 3) in the plane at times since the begin."""
         return pose_from_xyt(self.xyt_at(times_s))
+
+    def spatial_poses_at(self, times_s: FloatArray) -> FloatArray:
+        """T_world_base (n, 4, 4) at times since the begin, tilted and lifted as the ground is."""
+        distance, path = self.distance_at(times_s), self.path
+        columns = (path.height_m, *path.gradient.T)
+        height, *gradient = (np.interp(distance, path.distance_m, column) for column in columns)
+        xyt = self.xyt_at(times_s)
+        R = rotation_on_ground(xyt[:, 2], np.stack(gradient, axis=1))
+        return pose_from_rotation_translation(R, np.column_stack([xyt[:, :2], height]))
 
 
 def drive_path(path: Path, settings: DriveSettings) -> Motion:

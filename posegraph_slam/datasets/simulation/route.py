@@ -11,7 +11,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.datasets.simulation.settings import DriveSettings
+from posegraph_slam.datasets.simulation.terrain import Terrain
 from posegraph_slam.datasets.simulation.world import FloorPlan
+from posegraph_slam.geometry import SO3
 
 Node = tuple[int, int]
 STEP_M = 0.01
@@ -27,14 +29,21 @@ STOP_SHORT_M = 0.35
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Path:
-    """Samples of a smooth path: travelled distance (P,), position (P, 2) and unwrapped heading (P,) of its tangent."""
+    """Samples of a smooth path: travelled distance (P,), position (P, 2) and unwrapped heading (P,) of its tangent.
+
+    `height_m` (P,) and `gradient` (P, 2) are the ground's, zero where it is flat; distance runs along the ground.
+    `turn_rad` (P,) is the turn about the robot's own vertical axis, on flat ground the heading.
+    """
 
     distance_m: FloatArray
     position_m: FloatArray
     heading_rad: FloatArray
+    height_m: FloatArray
+    gradient: FloatArray
+    turn_rad: FloatArray
 
     def __post_init__(self) -> None:
-        for name in ("distance_m", "position_m", "heading_rad"):
+        for name in ("distance_m", "position_m", "heading_rad", "height_m", "gradient", "turn_rad"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
@@ -150,7 +159,44 @@ def smooth_path(corners: FloatArray, settings: DriveSettings, rng: np.random.Gen
     heading = np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))
     at = np.arange(0.0, distance[-1] - RUN_IN_M - STOP_SHORT_M, STEP_M)
     columns = [np.interp(at, distance, values) for values in (position[:, 0], position[:, 1], heading)]
-    return Path(distance_m=at, position_m=np.stack(columns[:2], axis=1), heading_rad=columns[2])
+    return Path(
+        distance_m=at,
+        position_m=np.stack(columns[:2], axis=1),
+        heading_rad=columns[2],
+        height_m=np.zeros(len(at)),
+        gradient=np.zeros((len(at), 2)),
+        turn_rad=columns[2],
+    )
+
+
+def lift_path(path: Path, terrain: Terrain) -> Path:
+    """Lay a planar path onto the ground, sampled anew every `STEP_M` along it."""
+    height, _ = terrain.ground(path.position_m)
+    distance = _travelled(np.column_stack([path.position_m, height]))
+    at = np.arange(0.0, distance[-1], STEP_M)
+    x, y, heading = (np.interp(at, distance, column) for column in (*path.position_m.T, path.heading_rad))
+    position = np.stack([x, y], axis=1)
+    height, gradient = terrain.ground(position)
+    R = rotation_on_ground(heading, gradient)
+    turn = SO3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:])[:, 2]
+    return Path(
+        distance_m=at,
+        position_m=position,
+        heading_rad=heading,
+        height_m=height,
+        gradient=gradient,
+        turn_rad=heading[0] + np.concatenate([[0.0], np.cumsum(turn)]),
+    )
+
+
+def rotation_on_ground(heading_rad: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Rotation (n, 3, 3) of a robot that stands on ground of `gradient` (n, 2) with its x axis above its heading (n,)."""
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    x = np.stack([c, s, gradient[:, 0] * c + gradient[:, 1] * s], axis=1)
+    z = np.column_stack([-gradient, np.ones(len(gradient))])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=2)
 
 
 def _normals(positions: FloatArray) -> FloatArray:

@@ -10,11 +10,11 @@ import numpy as np
 from posegraph_slam.arrays import Float32Array, FloatArray, IntArray
 from posegraph_slam.datasets.simulation import robot, streams
 from posegraph_slam.datasets.simulation.motion import Motion, drive_path
-from posegraph_slam.datasets.simulation.route import plan_path
+from posegraph_slam.datasets.simulation.route import lift_path, plan_path
 from posegraph_slam.datasets.simulation.settings import SimulationSettings
 from posegraph_slam.datasets.simulation.world import World, build_world
 from posegraph_slam.execution import Progress, silent_progress
-from posegraph_slam.geometry import Trajectory, spatial_from_planar
+from posegraph_slam.geometry import Trajectory
 from posegraph_slam.sensors import STANDARD_GRAVITY, Imu, LaserScans, RgbdFrames, RobotLog, WheelEncoders
 
 KINECT_DELAY_S = 1.0
@@ -49,7 +49,7 @@ class SimulatedRun:
 
     def truth(self) -> Trajectory:
         """Return the pose T_ref_base (L, 4, 4) at every scan; `ref` is the frame of the world."""
-        poses = spatial_from_planar(self.motion.poses_at(self.lidar_times_s))
+        poses = self.motion.spatial_poses_at(self.lidar_times_s)
         return Trajectory(stamps_s=self.stamps(self.lidar_times_s), poses=poses, parent="ref", child="base")
 
 
@@ -64,7 +64,8 @@ def simulate_run(settings: SimulationSettings, progress: Progress = silent_progr
     Memory grows with the scans alone (4 bytes a beam). Raises nothing of its own: the settings are checked already.
     """
     world = build_world(settings.world, generator(settings, "world"))
-    motion = drive_path(plan_path(world.plan, settings.drive, generator(settings, "route")), settings.drive)
+    path = plan_path(world.plan, settings.drive, generator(settings, "route"))
+    motion = drive_path(path if world.terrain is None else lift_path(path, world.terrain), settings.drive)
     end = motion.end_s
     rng = {name: generator(settings, name) for name in ("encoders", "imu", "lidar", "kinect")}
     encoder_times = streams.stamp_times(settings.encoders.rate_hz, 0.0, end, rng["encoders"])

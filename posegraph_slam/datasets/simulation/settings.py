@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from posegraph_slam.settings import Settings
+
+LANDING_M = 0.35
+"""Level piece before and after each ramp, beside the corridors that it joins."""
+
+
+class RampSettings(Settings):
+    """Levels and ramps of a world of kind `ramps`."""
+
+    rise_min_m: float = Field(0.4, gt=0, le=5, description="Least difference in height of neighbouring levels")
+    rise_max_m: float = Field(0.9, gt=0, le=5, description="Largest difference in height of neighbouring levels")
+    slope_min_deg: float = Field(18.0, ge=5, le=25, description="Least slope of a ramp")
+    slope_max_deg: float = Field(20.0, ge=5, le=25, description="Largest slope of a ramp")
+    ceiling_m: float = Field(2.4, ge=1, le=20, description="Height of the ceiling above the highest level")
+    clutter_min_m: float = Field(0.8, gt=0, description="Least height of boxes and pillars above the ground")
+    clutter_max_m: float = Field(1.8, gt=0, description="Largest height of boxes and pillars above the ground")
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        for name, unit in (("rise", "m"), ("slope", "deg"), ("clutter", "m")):
+            low, high = getattr(self, f"{name}_min_{unit}"), getattr(self, f"{name}_max_{unit}")
+            if low > high:
+                raise ValueError(f"{name}_min_{unit} {low:g} is above {name}_max_{unit} {high:g}")
+        return self
 
 
 class WorldSettings(Settings):
     """The floor plan: blocks of rooms, two rooms deep, in a net of corridors."""
 
+    kind: Literal["flat", "ramps"] = Field("flat", description="flat, or ramps: corridors on levels, joined by ramps")
+    ramps: RampSettings = RampSettings()
     blocks_across: int = Field(1, ge=1, le=20, description="Blocks of rooms along x; more make a larger world")
     blocks_up: int = Field(1, ge=1, le=20, description="Blocks of rooms along y")
     rooms_across: int = Field(3, ge=1, le=10, description="Rooms along x in each block")
@@ -21,6 +47,14 @@ class WorldSettings(Settings):
     door_width_m: float = Field(1.1, ge=1.0, le=2.0, description="Clear width of a door")
     passable_fraction: float = Field(0.7, ge=0, le=1, description="Share of room pairs with a door between the two")
     clutter: float = Field(1.0, ge=0, le=2, description="Boxes, pillars and tables, relative to the usual number")
+
+    @model_validator(mode="after")
+    def _check_ramps(self) -> Self:
+        length = self.ramps.rise_max_m / float(np.tan(np.radians(self.ramps.slope_min_deg)))
+        room = 2 * (self.room_depth_m - LANDING_M)
+        if self.kind == "ramps" and length > room:
+            raise ValueError(f"a ramp of {length:.1f} m does not fit into the {room:.1f} m between two corridors")
+        return self
 
 
 class DriveSettings(Settings):
@@ -52,6 +86,7 @@ class ImuSettings(Settings):
     sigma_scale: float = Field(0.01, ge=0, le=0.2, description="Scale error of the gyro, drawn once")
     sigma_walk_rad_s: float = Field(0.0003, ge=0, le=0.05, description="Walk of the gyro bias after one second")
     sigma_accelerometer_g: float = Field(0.003, ge=0, le=0.5, description="Noise of one accelerometer sample")
+    sigma_accelerometer_bias_g: float = Field(0.005, ge=0, le=0.5, description="Its bias, drawn once for each axis")
     missing_tail_s: float = Field(1.0, ge=0, le=60, description="The stream ends this much before the others")
 
 
@@ -63,6 +98,7 @@ class LidarSettings(Settings):
     sigma_range_m: float = Field(0.01, ge=0, le=1, description="Noise of one range")
     dropout_rate: float = Field(0.005, ge=0, le=1, description="Share of ranges lost and reported as 0.001")
     no_return_rate: float = Field(0.005, ge=0, le=1, description="Share of beams that come back as 60")
+    antennae: bool = Field(False, description="Two antennae behind the scanner, which it sees in every scan")
     sweep_s: float = Field(0.0, ge=0, le=0.2, description="Time from first to last beam; 0: all at the stamp")
 
 
@@ -97,6 +133,12 @@ class SimulationSettings(Settings):
     lidar: LidarSettings = LidarSettings()
     kinect: KinectSettings = KinectSettings()
 
+    @model_validator(mode="after")
+    def _check_images(self) -> Self:
+        if self.world.kind == "ramps" and self.kinect.images:
+            raise ValueError("images are not rendered in a world of ramps: set kinect.images = false")
+        return self
+
 
 def demo_settings(**overrides: Any) -> SimulationSettings:
     """Return the settings of the built-in demo: two laps of a 14 m by 9 m floor, images included.
@@ -104,6 +146,20 @@ def demo_settings(**overrides: Any) -> SimulationSettings:
     `overrides` replace whole fields of `SimulationSettings`, for example `seed=7`.
     """
     return SimulationSettings(**overrides)
+
+
+def ramp_settings(**overrides: Any) -> SimulationSettings:
+    """Return the settings of a drive over ramps of 18 to 20 degrees, with antennae in view and without images.
+
+    `overrides` replace whole fields of `SimulationSettings`, for example `seed=7`.
+    """
+    chosen = {
+        "world": WorldSettings(kind="ramps"),
+        "lidar": LidarSettings(antennae=True),
+        "kinect": KinectSettings(images=False),
+        **overrides,
+    }
+    return SimulationSettings(**chosen)
 
 
 def tiny_settings(*, seed: int = 1, duration_s: float = 12.0, images: bool = False) -> SimulationSettings:

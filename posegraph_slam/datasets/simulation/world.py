@@ -1,7 +1,8 @@
 """The indoor world: blocks of rooms in a net of corridors, with doors, boxes, round pillars and tables.
 
-Every obstacle stands from the floor to above all sensors, so that the plan view is the whole truth. The origin of the
-world frame is where the robot starts, on the lowest corridor, heading along +x.
+On flat ground every obstacle stands from the floor to above all sensors, so that the plan view is the whole truth; on
+terrain with ramps clutter has a height. The origin of the world frame is where the robot starts, on the lowest
+corridor, heading along +x.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 
 from posegraph_slam.arrays import BoolArray, ByteArray, FloatArray, read_only
 from posegraph_slam.datasets.simulation.settings import WorldSettings
+from posegraph_slam.datasets.simulation.terrain import Terrain, build_terrain
 
 WALL_M = 0.12
 """Thickness of a wall."""
@@ -39,7 +41,8 @@ class FloorPlan:
 class World:
     """Obstacles in plan view: `segments` (S, 4) [xa, ya, xb, yb] and `circles` (C, 3) [x, y, radius], metres.
 
-    `colours` (S + C, 3) are their RGB colours, segments first. `lower_m` and `upper_m` (2,) bound the world.
+    `colours` (S + C, 3) are their RGB colours, segments first. `lower_m` and `upper_m` (2,) bound the world. `terrain`
+    is None where the ground is flat.
     """
 
     segments: FloatArray
@@ -48,6 +51,7 @@ class World:
     lower_m: FloatArray
     upper_m: FloatArray
     plan: FloorPlan
+    terrain: Terrain | None = None
 
     def __post_init__(self) -> None:
         for name in ("segments", "circles", "lower_m", "upper_m"):
@@ -121,6 +125,27 @@ def build_world(settings: WorldSettings, rng: np.random.Generator) -> World:
         lower_m=lower,
         upper_m=upper,
         plan=plan,
+        terrain=_draw_terrain(obstacles, plan, settings, rng) if settings.kind == "ramps" else None,
+    )
+
+
+def _draw_terrain(obstacles: _Obstacles, plan: FloorPlan, settings: WorldSettings, rng: np.random.Generator) -> Terrain:
+    """Put the corridors on levels, and give clutter a height; walls reach the ceiling."""
+    boxes = np.asarray(obstacles.boxes).reshape(-1, 5)
+    wall = np.array([colour == WALL_COLOUR for colour in obstacles.box_colours])
+    ramps = settings.ramps
+    standing = rng.uniform(ramps.clutter_min_m, ramps.clutter_max_m, size=len(boxes) + len(obstacles.circles))
+    standing[: len(boxes)][wall] = np.inf
+    sides = np.repeat(np.arange(len(boxes)), 4)
+    rows = np.concatenate([sides, np.arange(len(boxes), len(standing))])
+    places = np.concatenate([boxes[:, :2], np.asarray(obstacles.circles).reshape(-1, 3)[:, :2]])
+    return build_terrain(
+        settings,
+        corridor_x=plan.corridor_x,
+        corridor_y=plan.corridor_y,
+        obstacles=places[rows],
+        standing=standing[rows],
+        rng=rng,
     )
 
 
@@ -134,7 +159,8 @@ def _draw_plan(settings: WorldSettings, rng: np.random.Generator) -> FloorPlan:
     free = max(settings.room_width_m / 2 - settings.door_width_m / 2 - 0.35, 0.0)
     centres = x[:-1, None, None] + settings.corridor_width_m / 2 + (np.arange(rooms) + 0.5) * settings.room_width_m
     doors = centres + rng.uniform(-free, free, size=(across, up, rooms))
-    passable = rng.random(doors.shape) < settings.passable_fraction
+    # rooms on two levels have no door between them
+    passable = rng.random(doors.shape) < (settings.passable_fraction if settings.kind == "flat" else 0.0)
     return FloorPlan(corridor_x=x - doors[0, 0, 0], corridor_y=y, door_x=doors - doors[0, 0, 0], passable=passable)
 
 
