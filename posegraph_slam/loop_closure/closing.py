@@ -21,6 +21,8 @@ from posegraph_slam.loop_closure.proposals import (
 )
 from posegraph_slam.loop_closure.settings import LoopClosureSettings, VerificationSettings
 from posegraph_slam.loop_closure.verification import (
+    Apart,
+    apart_reasons,
     chi2_gate,
     consistency_reasons,
     count_support,
@@ -60,11 +62,13 @@ def close_loops(
     *,
     executor: Executor | None = None,
     progress: Progress = silent_progress,
+    apart: Apart | None = None,
 ) -> LoopClosureResult:
     """Add loop closures to a chain of keyframes: `graph` (K nodes, base poses) and their `scans` (K).
 
     Short loops come first: each round takes the pairs with less uncovered travel than a limit that doubles when a
-    round brings nothing new. What disagrees with the solved graph is taken out again.
+    round brings nothing new. What disagrees with the solved graph is taken out again. Pairs that are `apart` are
+    refused, whatever their scans say.
     """
     executor = executor or SerialExecutor()
     chain, ledger = graph.constraints, Ledger()
@@ -76,7 +80,8 @@ def close_loops(
         progress("loop closure", round_, settings.proposals.rounds_max)
         candidates = _propose(graph, path_m, closures, limit, first=round_ == 0, settings=settings)
         candidates = candidates.select(ledger.untried(candidates))
-        found = _verify(candidates, graph, scans, path_m, round_, ledger, settings.verification, executor)
+        refused = apart_reasons(candidates, graph.poses, apart)
+        found = _verify(candidates, graph, scans, path_m, round_, ledger, settings.verification, executor, refused)
         if len(found):
             closures = Constraints.concatenate([closures, found])
             graph, sigmas, kept = settle(graph, chain, closures, solver, settings.verification.sigma_max)
@@ -123,8 +128,9 @@ def _verify(
     ledger: Ledger,
     settings: VerificationSettings,
     executor: Executor,
+    refused: list[str],
 ) -> Constraints:
-    """Register the candidates and return those that pass as constraints between base poses."""
+    """Register the candidates and return those that pass as constraints between base poses, none of the `refused`."""
     lidar = graph.poses @ scans.T_base_lidar
     linear = linearise(graph, settings.drift)
     covariance = linear.relative_covariance(candidates.target, candidates.source)
@@ -133,7 +139,7 @@ def _verify(
     constraints = constraints_of(
         candidates, evidence, scans, settings.covariance_floor_m, settings.covariance_floor_rad
     )
-    reasons = rejection_reasons(candidates, evidence, settings)
+    reasons = first_reasons(refused, rejection_reasons(candidates, evidence, settings))
     sigmas = gaussian_sigmas(innovation(linear, constraints, covariance), graph.group.dof)
     sigmas[~passing(reasons)] = np.nan
     reasons = first_reasons(reasons, surprise_reasons(sigmas, settings))

@@ -13,7 +13,7 @@ from posegraph_slam.loop_closure.matching import constraints_of, register_candid
 from posegraph_slam.loop_closure.proposals import Candidates
 from posegraph_slam.loop_closure.settings import VerificationSettings
 from posegraph_slam.loop_closure.transients import without_transients
-from posegraph_slam.loop_closure.verification import chi2_gate, passing, rejection_reasons
+from posegraph_slam.loop_closure.verification import Apart, apart_reasons, chi2_gate, passing, rejection_reasons
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
 from posegraph_slam.pose_graph.residuals import chi2, constraint_residuals
 from posegraph_slam.pose_graph.solve import solve
@@ -60,11 +60,13 @@ def refine_overlaps(
     *,
     executor: Executor | None = None,
     progress: Progress = silent_progress,
+    apart: Apart | None = None,
 ) -> PoseGraph:
     """Add the matches of overlapping keyframes to a graph that is right up to centimetres, and solve it again.
 
     `graph` (K nodes, base poses) and `scans` (K). Each round replaces the matches of the round before; those that
-    fail verification, move the pair too far, or lie beyond `verification.sigma_max` of the solution are left out.
+    fail verification, move the pair too far, or lie beyond `verification.sigma_max` of the solution are left out, and
+    so are pairs that are `apart`.
     """
     executor = executor or SerialExecutor()
     kept = graph.constraints
@@ -73,6 +75,8 @@ def refine_overlaps(
     for round_ in range(settings.rounds):
         progress("refinement", round_, settings.rounds)
         candidates = overlapping_pairs(graph, settings)
+        reasons = apart_reasons(candidates, graph.poses, apart)
+        candidates = candidates.select(np.flatnonzero(passing(reasons)))
         lasting = scans
         if settings.seen_through_min:
             lasting = without_transients(graph, scans, candidates, settings.seen_through_min, executor)

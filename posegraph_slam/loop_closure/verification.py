@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2 as chi2_distribution
@@ -14,6 +16,18 @@ from posegraph_slam.loop_closure.settings import VerificationSettings
 
 NEIGHBOURHOOD_M = 15.0
 """Candidates whose ends lie within this travel of each other are compared for consistency."""
+
+Apart = Callable[[IntArray, IntArray, FloatArray], BoolArray]
+"""Tells which pairs of keyframes i and j (M,), `distance_m` (M,) apart in the plan view, cannot be one place."""
+
+
+def apart_reasons(candidates: Candidates, poses: FloatArray, apart: Apart | None) -> list[str]:
+    """Say for each candidate (M,) that its ends at `poses` (K, 3, 3) are known to be apart, or the empty string."""
+    if apart is None:
+        return [""] * len(candidates)
+    step = poses[candidates.source, :2, 2] - poses[candidates.target, :2, 2]
+    flags = apart(candidates.target, candidates.source, np.linalg.norm(step, axis=1))
+    return ["on another level" if flag else "" for flag in flags.tolist()]
 
 
 def rejection_reasons(candidates: Candidates, evidence: Evidence, settings: VerificationSettings) -> list[str]:

@@ -65,16 +65,14 @@ def level_laser(
         on_ground = ground.hit(chunk, scans, poses[part] @ scans.T_base_lidar)
         counts += [robot.sum(), (on_ground & ~robot).sum()]
         chunk[robot | on_ground] = 0.0
-    R = odometry.R_level_lidar
+    R = odometry.level_rotations
     level = level_ranges(
         ranges,
         scans.angles_rad,
         pose_from_rotation_translation(R, np.zeros((len(R), 3))),
         heights_m=(-settings.box_below_m, settings.box_above_m),
         limits_m=np.array([max(scans.range_min_m, 1e-6), scans.range_max_m]),
-        fan=LevelFan(
-            angle_min_rad=scans.angle_min_rad, increment_rad=scans.angle_increment_rad, count=scans.beams
-        ),
+        fan=LevelFan(angle_min_rad=scans.angle_min_rad, increment_rad=scans.angle_increment_rad, count=scans.beams),
     )
     share = 100.0 / max(ranges.size, 1)
     remark = (
@@ -82,9 +80,7 @@ def level_laser(
         f"{share * counts[0]:.1f} % are the robot, {share * (level.too_low + counts[1]):.1f} % ground and "
         f"{share * level.too_high:.1f} % ceiling: they are left out"
     )
-    return LevelledScans(
-        scans=replace(scans, ranges_m=level.ranges_m, T_base_lidar=np.eye(4)), remarks=(remark,)
-    )
+    return LevelledScans(scans=replace(scans, ranges_m=level.ranges_m, T_base_lidar=np.eye(4)), remarks=(remark,))
 
 
 class _DrivenGround:

@@ -57,14 +57,14 @@ class SpatialOdometry:
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
-    def T_odom_lidar(self) -> FloatArray:
-        """Poses (N, 4, 4) of the scanner."""
+    def lidar_poses(self) -> FloatArray:
+        """Poses T_odom_lidar (N, 4, 4) of the scanner."""
         return np.asarray(self.trajectory.poses @ self.T_base_lidar)
 
     @property
-    def R_level_lidar(self) -> FloatArray:
-        """Rotations (N, 3, 3) from the scanner to the level frame at the same place with the same heading."""
-        return without_heading(self.T_odom_lidar[:, :3, :3])
+    def level_rotations(self) -> FloatArray:
+        """Rotations R_level_lidar (N, 3, 3) to the level frame at the same place with the same heading."""
+        return without_heading(self.lidar_poses[:, :3, :3])
 
     def lift(self, planar: Trajectory, height_m: FloatArray | None = None) -> Trajectory:
         """Turn planar poses (N, 3, 3) of the level lidar frame into poses (N, 4, 4) of the base.
@@ -72,10 +72,10 @@ class SpatialOdometry:
         Tilt is the odometry's, and so are the scanner's heights unless `height_m` (N,) gives others.
         """
         xyt = xyt_from_pose(planar.poses)
-        height = self.T_odom_lidar[:, 2, 3] if height_m is None else height_m
+        height = self.lidar_poses[:, 2, 3] if height_m is None else height_m
         turn = np.zeros((len(xyt), 3))
         turn[:, 2] = xyt[:, 2]
-        R = SO3.exp(turn) @ self.R_level_lidar
+        R = SO3.exp(turn) @ self.level_rotations
         T = pose_from_rotation_translation(R, np.column_stack([xyt[:, :2], height]))
         return planar.with_poses(T @ inverse_pose(self.T_base_lidar))
 

@@ -63,7 +63,7 @@ class Tilt:
         return np.interp(stamps_s, self.stamps_s, self.sigma_rad)
 
     def heading_rate(self, rate_up: FloatArray, imu: Imu) -> FloatArray:
-        """Rate (M,) of the heading from the rate (M,) about the body's z axis, its bias taken off, and the imu's others.
+        """Rate (M,) of the heading from that about the body's z axis (M,), its bias taken off, and the imu's others.
 
         psi' = (omega_y sin(roll) + omega_z cos(roll)) / cos(pitch).
         """
@@ -133,7 +133,10 @@ def _level_offset(accel: FloatArray, settings: TiltSettings) -> tuple[FloatArray
     if tilt > settings.level_start_max_rad:
         return np.zeros(3), f"the log begins at a tilt of {np.degrees(tilt):.1f} deg, which is taken for a slope"
     offset = mean - [0.0, 0.0, STANDARD_GRAVITY]
-    return offset, f"the accelerometer shows a tilt of {np.degrees(tilt):.2f} deg on the level start, which is taken off"
+    return (
+        offset,
+        f"the accelerometer shows a tilt of {np.degrees(tilt):.2f} deg on the level start, which is taken off",
+    )
 
 
 def _tilt_sigma(estimate: AttitudeEstimate) -> FloatArray:

@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -22,10 +22,18 @@ from posegraph_slam.odometry.scan_matching import ScanMatchingSettings
 from posegraph_slam.odometry.settings import OdometrySettings
 from posegraph_slam.odometry.timing import TimingSettings
 from posegraph_slam.pipeline.settings_files import Layer, build_settings, parse_override, read_layer
+from posegraph_slam.pipeline.spatial import SpatialSettings
 from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
 from posegraph_slam.registration.beam_scans import BeamScanSettings
 from posegraph_slam.settings import Settings
+
+
+class PoseGraphSettings(SolverSettings):
+    """The pose graph of a run and how it is solved."""
+
+    group: Literal["se2", "se3"] = "se2"
+    """se2: poses in the plane; se3: poses in space, for a robot with wheel encoders and IMU on ramps and slopes."""
 
 
 class Configuration(Settings):
@@ -44,7 +52,8 @@ class Configuration(Settings):
     smoothing: bool = True
     """Smooth the poses of all scans with odometry from wheels, which is known at the scans' own stamps; poses that a
     logger wrote beside the scans lag by an unknown part of a scan and would only bend the path."""
-    pose_graph: SolverSettings = SolverSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
+    pose_graph: PoseGraphSettings = PoseGraphSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
+    spatial: SpatialSettings = SpatialSettings()
     maps: bool = True
     """Rebuild the maps from the trajectories."""
     mapping: OccupancySettings = OccupancySettings()

@@ -14,7 +14,7 @@ from posegraph_slam.errors import InputError
 from posegraph_slam.evaluation.summary import compare, evaluate_trajectory
 from posegraph_slam.evaluation.tables import ComparisonTable
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
-from posegraph_slam.geometry import SE2, Trajectory, deform
+from posegraph_slam.geometry import SE2, Trajectory
 from posegraph_slam.loop_closure.closing import LoopClosureResult, close_loops
 from posegraph_slam.loop_closure.ledger import LoopRecord
 from posegraph_slam.loop_closure.refinement import refine_overlaps
@@ -22,12 +22,10 @@ from posegraph_slam.mapping.crispness import crispness
 from posegraph_slam.mapping.occupancy import OccupancyGrid, OccupancySettings, build_occupancy
 from posegraph_slam.mapping.texture import TextureMap, build_texture
 from posegraph_slam.odometry.scan_matching import ScanMatchingResult
-from posegraph_slam.odometry.scan_odometry import odometry_at_scans
-from posegraph_slam.odometry.smoothing import smooth
-from posegraph_slam.odometry.timing import without_lag
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.matching import keyframe_scans, match_log, motion_in_sweep
+from posegraph_slam.pipeline.plan_view import PlanView
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
 from posegraph_slam.registration.beam_scans import BeamScans
 from posegraph_slam.sensors import LaserScans, RobotLog
@@ -91,23 +89,21 @@ def optimize(
     executor, clock = executor or SerialExecutor(), StageClock()
     scans = usable_scans(log)
     with clock.stage("odometry"):
-        odometry = odometry_at_scans(log, configuration.odometry)
+        view = PlanView.of(log, scans, configuration)
+        odometry = view.odometry
     with clock.stage("scan matching"):
         if matched is None:
-            matched = match_log(scans, odometry, configuration, executor=executor, progress=progress)
-        in_time = without_lag(odometry, matched.lag)
-        beams = keyframe_scans(scans, matched, configuration, executor)
+            matched = match_log(view.scans, odometry, view.configuration, executor=executor, progress=progress)
+        beams = keyframe_scans(view.scans, matched, view.configuration, executor)
     with clock.stage("loop closure"):
-        closed = _close(matched, beams, configuration, executor, progress)
+        closed = _close(matched, beams, view, executor, progress)
     with clock.stage("refinement"):
-        graph = _refine(closed.graph, matched, beams, configuration, executor, progress)
-        optimised = deform(matched.trajectory, matched.keyframes, graph.poses)
-        if configuration.smoothing and odometry.source in ("wheels", "wheels_imu"):
-            optimised = smooth(optimised, matched.scan_information, in_time)
-    stages = dict(zip(STAGES, (odometry.trajectory, matched.trajectory, in_map_frame(optimised)), strict=True))
+        graph = _refine(closed.graph, matched, beams, view, executor, progress)
+        graph, optimised = view.finish(graph, matched, progress)
+    found = (view.lifted(odometry.trajectory), view.lifted(matched.trajectory), in_map_frame(optimised))
+    stages = dict(zip(STAGES, found, strict=True))
     with clock.stage("maps"):
-        motion = motion_in_sweep(scans, matched.trajectory.poses, matched.sweep, configuration.timing)
-        occupancy, crisp = _maps(scans, stages, motion, matched.keyframes, configuration, executor, progress)
+        occupancy, crisp = _maps(view, stages, matched, executor, progress)
         texture = _texture(log, stages["optimised"], occupancy, configuration, executor, progress)
     with clock.stage("evaluation"):
         measured = {
@@ -135,24 +131,25 @@ def optimize(
         },
         stages_s=clock.seconds,
         truth=log.truth,
-        remarks=(*log.remarks, *odometry.remarks, *matched.remarks, *_warnings(closed)),
+        remarks=(*log.remarks, *odometry.remarks, *view.remarks, *matched.remarks, *_warnings(closed)),
     )
 
 
 def _close(
     matched: ScanMatchingResult,
     beams: BeamScans,
-    configuration: Configuration,
+    view: PlanView,
     executor: Executor,
     progress: Progress,
 ) -> LoopClosureResult:
     return close_loops(
         keyframe_chain(matched),
         beams,
-        configuration.loop_closure,
-        configuration.pose_graph,
+        view.configuration.loop_closure,
+        view.configuration.pose_graph,
         executor=executor,
         progress=progress,
+        apart=view.apart(matched.keyframes),
     )
 
 
@@ -160,11 +157,12 @@ def _refine(
     graph: PoseGraph,
     matched: ScanMatchingResult,
     beams: BeamScans,
-    configuration: Configuration,
+    view: PlanView,
     executor: Executor,
     progress: Progress,
 ) -> PoseGraph:
     """Match overlapping keyframes again, unless loop closure is off: then the chain of scan matching stands."""
+    configuration = view.configuration
     if not configuration.loop_closure.enabled:
         return graph
     return refine_overlaps(
@@ -175,23 +173,26 @@ def _refine(
         configuration.pose_graph,
         executor=executor,
         progress=progress,
+        apart=view.apart(matched.keyframes),
     )
 
 
 def _maps(
-    scans: LaserScans,
+    view: PlanView,
     stages: Mapping[str, Trajectory],
-    motion: FloatArray,
-    keyframes: IntArray,
-    configuration: Configuration,
+    matched: ScanMatchingResult,
     executor: Executor,
     progress: Progress,
 ) -> tuple[OccupancyGrid | None, dict[str, float]]:
     """Build the occupancy map of all scans, and those of the keyframes at each stage for their crispness alone."""
+    configuration = view.configuration
     if not configuration.maps:
         return None, {}
-    final = _MapWork(trajectory=stages["optimised"], index=np.arange(len(scans)), keep=True)
-    compared = [_MapWork(trajectory=trajectory, index=keyframes, keep=False) for trajectory in stages.values()]
+    scans = view.scans_from(stages["optimised"])
+    motion = motion_in_sweep(scans, matched.trajectory.poses, matched.sweep, configuration.timing)
+    plans = {name: view.plan(trajectory) for name, trajectory in stages.items()}
+    final = _MapWork(trajectory=plans["optimised"], index=np.arange(len(scans)), keep=True)
+    compared = [_MapWork(trajectory=trajectory, index=matched.keyframes, keep=False) for trajectory in plans.values()]
     build = partial(_build_map, scans=scans, motion=motion, settings=configuration.mapping, progress=progress)
     (occupancy, _), *measured = executor.map(build, [final, *compared])
     return occupancy, dict(zip(stages, (figure for _, figure in measured), strict=True))

@@ -9,7 +9,7 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
-from posegraph_slam.geometry import SE3, Trajectory, inverse_pose, xyt_from_pose
+from posegraph_slam.geometry import SE3, Trajectory, inverse_pose
 from posegraph_slam.odometry.levelling import LevellingSettings
 from posegraph_slam.odometry.spatial import SpatialOdometry, SpatialOdometrySettings
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
@@ -26,6 +26,10 @@ class SpatialSettings(Settings):
 
     odometry: SpatialOdometrySettings = SpatialOdometrySettings()
     levelling: LevellingSettings = LevellingSettings()
+    search_reach_m: float = Field(default=0.3, gt=0)
+    """Wheels and gyro know each step to within this: scan matching searches no further where few points match,"""
+    search_reach_rad: float = Field(default=0.3, gt=0)
+    """nor turns further. On a ramp little but the side walls is left to match, and those slide along themselves."""
     tilt_sigma_min_rad: float = Field(default=0.004, gt=0)
     """Roll and pitch of a keyframe are not known better than this, whatever the filter says."""
     same_ground_m: float = Field(default=0.4, ge=0)
@@ -33,7 +37,7 @@ class SpatialSettings(Settings):
     same_ground_sigma_m: float = Field(default=0.02, gt=0)
     """To within this."""
     level_gap_m: float = Field(default=0.5, gt=0)
-    """Places whose heights differ by more than this, beyond their uncertainty, are on two levels: no loop joins them."""
+    """Places whose heights differ by more than this, beyond their sigma, are on two levels: no loop joins them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,8 +78,8 @@ def lift_graph(graph: PoseGraph, odometry: SpatialOdometry, settings: SpatialSet
     keyframes = graph.index
     heights = Heights.of(odometry, keyframes, settings)
     plan = Trajectory(stamps_s=odometry.trajectory.stamps_s[keyframes], poses=graph.poses, parent="odom", child="base")
-    lidar_height = odometry.T_odom_lidar[keyframes, 2, 3]
-    tilted = _Lift(R=odometry.R_level_lidar[keyframes], T_lidar_base=inverse_pose(odometry.T_base_lidar))
+    lidar_height = odometry.lidar_poses[keyframes, 2, 3]
+    tilted = _Lift(R=odometry.level_rotations[keyframes], T_lidar_base=inverse_pose(odometry.T_base_lidar))
     poses = tilted.base(plan.poses, lidar_height, np.arange(len(graph)))
     parts = [
         _lifted_constraints(graph.constraints, tilted, lidar_height, heights),

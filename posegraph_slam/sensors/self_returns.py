@@ -79,7 +79,9 @@ def find_self_returns(ranges_m: Float32Array, travel_m: FloatArray, settings: Se
     seen = gathered[np.arange(beams), best] >= settings.share_min * len(moving)
     weights = np.where(np.abs(np.arange(bins) - best[:, None]) <= half, counts, 0)
     middle = (weights @ (np.arange(bins) + 0.5) * BIN_M) / np.maximum(weights.sum(axis=1), 1)
-    return SelfReturns(range_m=_widened(np.where(seen, middle, np.nan), settings.margin_beams), spread_m=settings.spread_m)
+    return SelfReturns(
+        range_m=_widened(np.where(seen, middle, np.nan), settings.margin_beams), spread_m=settings.spread_m
+    )
 
 
 def _widened(ranges: FloatArray, beams: int) -> FloatArray:

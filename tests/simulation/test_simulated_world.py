@@ -19,8 +19,8 @@ from posegraph_slam.datasets.simulation.raycast import cast_scans
 from posegraph_slam.datasets.simulation.route import plan_path
 from posegraph_slam.datasets.simulation.run import generator
 from posegraph_slam.datasets.simulation.streams import lidar_poses
-from posegraph_slam.geometry import xyt_from_pose
 from posegraph_slam.datasets.simulation.world import build_world
+from posegraph_slam.geometry import xyt_from_pose
 
 
 def slow_ranges(pose, bearings, segments, circles):

@@ -190,7 +190,7 @@ def lift_path(path: Path, terrain: Terrain) -> Path:
 
 
 def rotation_on_ground(heading_rad: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Rotation (n, 3, 3) of a robot that stands on ground of `gradient` (n, 2) with its x axis above its heading (n,)."""
+    """Rotation (n, 3, 3) of a robot on ground of `gradient` (n, 2) whose x axis lies above its heading (n,)."""
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     x = np.stack([c, s, gradient[:, 0] * c + gradient[:, 1] * s], axis=1)
     z = np.column_stack([-gradient, np.ones(len(gradient))])
