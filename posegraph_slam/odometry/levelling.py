@@ -105,7 +105,7 @@ class _DrivenGround:
         points += T[rows, :3, 3]
         distance, nearest = self.tree.query(points[:, :2], distance_upper_bound=reach)
         beside = np.flatnonzero(np.isfinite(distance))
-        at = nearest[beside]
+        at = np.asarray(nearest)[beside]
         above = np.sum((points[beside] - self.places[at]) * self.up[at], axis=1)
         low = above < self.settings.ground_height_m
         result[rows[beside[low]], beams[beside[low]]] = True

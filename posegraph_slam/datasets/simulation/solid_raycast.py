@@ -13,8 +13,8 @@ from posegraph_slam.jit import kernel
 @kernel
 def _beams_between(bearings: FloatArray, low: float, high: float, turn: int) -> tuple[int, int]:
     """First and one past the last of the rising `bearings` in [low, high], `turn` times round, with one of slack."""
-    first = np.searchsorted(bearings, low + turn * 2.0 * math.pi) - 1
-    last = np.searchsorted(bearings, high + turn * 2.0 * math.pi) + 1
+    first = int(np.searchsorted(bearings, low + turn * 2.0 * math.pi)) - 1
+    last = int(np.searchsorted(bearings, high + turn * 2.0 * math.pi)) + 1
     return max(first, 0), min(last, len(bearings))
 
 

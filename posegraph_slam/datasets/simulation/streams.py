@@ -88,7 +88,7 @@ def lidar_poses(motion: Motion, times_s: FloatArray, settings: LidarSettings) ->
     sectors = SECTORS if settings.sweep_s > 0 else 1
     offsets = settings.sweep_s * (np.arange(sectors) + 0.5) / sectors
     poses = motion.spatial_poses_at((times_s[:, None] + offsets).ravel()) @ robot.T_BASE_LIDAR
-    return poses.reshape(len(times_s), sectors, 4, 4)
+    return np.asarray(poses).reshape(len(times_s), sectors, 4, 4)
 
 
 def lidar_ranges(
@@ -104,7 +104,7 @@ def lidar_ranges(
     Noise is Gaussian; lost ranges read 0.001 and beams without a return 60, as on the real robot.
     """
     ranges = np.empty((len(times_s), settings.beams), dtype=np.float32)
-    angles = robot.LIDAR_ANGLE_MIN_RAD + lidar_increment(settings) * np.arange(settings.beams)
+    angles: FloatArray = robot.LIDAR_ANGLE_MIN_RAD + lidar_increment(settings) * np.arange(settings.beams, dtype=float)
     posts = ranges_to_posts(angles, robot.ANTENNAE if settings.antennae else np.zeros((0, 3)))
     for start, stop in split_range(len(times_s), SCANS_A_CHUNK):
         poses = lidar_poses(motion, times_s[start:stop], settings)
