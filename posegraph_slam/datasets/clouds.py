@@ -60,16 +60,10 @@ def _read_npy(path: Path) -> FloatArray:
 
 
 def _read_mat(path: Path) -> FloatArray:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
+    from posegraph_slam.datasets.matlab import load_mat
 
-    try:
-        fields = loadmat(path)
-    except NotImplementedError as error:
-        raise InputError(path, "is a MATLAB 7.3 file", "save it in MATLAB by save -v7") from error
-    except (MatReadError, ValueError, TypeError, OSError, EOFError) as error:
-        raise InputError(path, f"cannot be read as a MATLAB file ({str(error).splitlines()[0]})") from error
-    arrays = {name: value for name, value in fields.items() if not name.startswith("__") and np.ndim(value) == 2}
+    fields = load_mat(path)
+    arrays = {name: value for name, value in fields.items() if np.ndim(value) == 2}
     clouds = {name: value for name, value in arrays.items() if value.dtype.kind in "iuf" and 3 in value.shape}
     if len(clouds) != 1:
         present = ", ".join(f"{name} {value.shape}" for name, value in arrays.items()) or "no array"

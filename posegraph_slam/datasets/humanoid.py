@@ -1,23 +1,20 @@
 """Logs of the walking humanoid of UPenn ESE650 and UCSD ECE276A: `train_lidar0.mat` beside `train_joint0.mat`.
 
-The LiDAR file is a cell array of structs, one a scan, with time, odometry, resolution, IMU angles and ranges; the
-joint file holds the head's angles on their own clock. docs/formats/humanoid.md describes both.
+The LiDAR file holds a struct a scan; the joint file holds the head's angles on their own clock.
+docs/formats/humanoid.md describes both.
 """
 
 from __future__ import annotations
 
 import re
-import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.datasets.coverage import uneven_coverage
+from posegraph_slam.datasets.humanoid_lidar import read_lidar
+from posegraph_slam.datasets.matlab import load_mat, require
 from posegraph_slam.datasets.tum import read_tum
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
@@ -32,18 +29,10 @@ GROUND_M = 0.1
 """Returns lower than this hit the ground."""
 FAR_JOINT_S = 0.1
 """A joint sample further away than this from its scan deserves a remark."""
-FIELDS = ("t", "pose", "res", "rpy", "scan")
-UNREADABLE = (
-    MatReadError,
-    ValueError,
-    TypeError,
-    OSError,
-    EOFError,
-    KeyError,
-    IndexError,
-    zlib.error,
-    NotImplementedError,
-)
+HEADINGS = {
+    True: "headings come from the IMU, steps from the logged odometry",
+    False: "the file has no IMU angles: headings come from the logged odometry, and the body counts as upright",
+}
 
 
 def detects(path: Path) -> bool:
@@ -59,23 +48,18 @@ def read(path: str | Path) -> RobotLog:
     """Read a LiDAR file (or the folder's only one) with its joint file into level scans and odometry.
 
     Every scan is placed by the nearest joint sample and the IMU's roll and pitch, freed of ground hits, and seen again
-    from the point of the ground below the body. The logged odometry gives the steps, the IMU the heading. Raises
-    InputError naming file and field.
+    from the point of the ground below the body. The logged odometry gives the steps, the IMU the heading; files
+    without IMU angles have the body upright and the odometry's heading. Raises InputError naming file and field.
     """
     path = Path(path)
     lidar_path = _locate(path)
-    joint_path = lidar_path.with_name(re.sub("lidar", "joint", lidar_path.name, flags=re.IGNORECASE))
-    if not joint_path.is_file():
-        raise InputError(joint_path, "is missing", "the head's angles are needed to place the scans")
-    joints = read_joints(joint_path)
-    fields = _lidar_fields(lidar_path)
-    stamps, rpy, ranges = fields["t"][:, 0], fields["rpy"], fields["scan"]
-    resolution = float(fields["res"][0, 0])
-    if not 0 < resolution < 0.2 or np.ptp(fields["res"]) > 1e-9:
-        raise InputError(lidar_path, f"field 'res' is {resolution:g} rad", "it must be one positive step for all scans")
+    joints = read_joints(_joint_path(lidar_path))
+    records = read_lidar(lidar_path)
+    stamps, ranges = records.stamps_s, records.ranges_m
+    tilt = np.zeros((len(stamps), 3)) if records.rpy_rad is None else records.rpy_rad
     index = joints.nearest(stamps)
-    T_base_lidar = lidar_on_level_body(joints.neck_yaw_rad[index], joints.head_pitch_rad[index], rpy[:, 0], rpy[:, 1])
-    angles = resolution * (np.arange(ranges.shape[1]) - (ranges.shape[1] - 1) / 2)
+    T_base_lidar = lidar_on_level_body(joints.neck_yaw_rad[index], joints.head_pitch_rad[index], tilt[:, 0], tilt[:, 1])
+    angles = records.resolution_rad * (np.arange(ranges.shape[1]) - (ranges.shape[1] - 1) / 2)
     levelled = level_ranges(
         ranges.astype(np.float32),
         angles,
@@ -96,7 +80,7 @@ def read(path: str | Path) -> RobotLog:
     far = int((np.abs(joints.stamps_s[index] - stamps) > FAR_JOINT_S).sum())
     remarks = [
         f"{dropped} returns of {ranges.size} hit the ground and were dropped",
-        "headings come from the IMU, steps from the logged odometry",
+        HEADINGS[records.rpy_rad is not None],
         *([f"{far} scans are more than {FAR_JOINT_S} s away from the nearest joint sample"] * (far > 0)),
         *uneven_coverage({"scans": stamps, "joints": joints.stamps_s}),
     ]
@@ -104,7 +88,7 @@ def read(path: str | Path) -> RobotLog:
         path=path,
         format="humanoid",
         scans=scans,
-        scan_odometry=imu_odometry(stamps, fields["pose"], rpy[:, 2]),
+        scan_odometry=imu_odometry(stamps, records.pose, (records.pose if records.rpy_rad is None else tilt)[:, 2]),
         truth=_truth(lidar_path),
         remarks=tuple(remarks),
     )
@@ -132,12 +116,9 @@ def read_joints(path: str | Path) -> JointAngles:
     Other fields of the file (acc, gyro, rpy, pos, ft_l, ft_r) are left alone. Raises InputError naming file and field.
     """
     path = Path(path)
-    content = _load(path)
-    for name in ("ts", "head_angles"):
-        if name not in content:
-            raise InputError(path, f"has no field '{name}'", f"it holds {', '.join(_names(content)) or 'nothing'}")
-    stamps = np.asarray(content["ts"], dtype=np.float64).reshape(-1)
-    angles = np.asarray(content["head_angles"], dtype=np.float64)
+    content = load_mat(path)
+    stamps = np.asarray(require(content, "ts", path), dtype=np.float64).reshape(-1)
+    angles = np.asarray(require(content, "head_angles", path), dtype=np.float64)
     if angles.shape != (2, len(stamps)) or len(stamps) == 0:
         raise InputError(path, f"field 'head_angles' has shape {angles.shape}", f"expected (2, {len(stamps)})")
     if not np.isfinite(angles).all() or not np.isfinite(stamps).all():
@@ -157,49 +138,16 @@ def _locate(path: Path) -> Path:
     return found[0]
 
 
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        return dict(loadmat(path, squeeze_me=False))
-    except UNREADABLE as error:
-        problem = (
-            f"cannot be read as a MATLAB file ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
-        )
-        raise InputError(path, problem, "the file may be truncated: copy it again") from error
-
-
-def _names(content: dict[str, Any]) -> list[str]:
-    return [name for name in content if not name.startswith("__")]
-
-
-def _lidar_fields(path: Path) -> dict[str, FloatArray]:
-    """Stack each field of the scans (N, n); a cell array of structs and a struct array are both understood."""
-    content = _load(path)
-    if "lidar" not in content:
-        raise InputError(path, "has no field 'lidar'", f"it holds {', '.join(_names(content)) or 'nothing'}")
-    cells = np.asarray(content["lidar"]).reshape(-1)
-    if len(cells) < 2:
-        raise InputError(path, f"holds {len(cells)} scans")
-    return {name: _stacked(path, cells, name) for name in FIELDS}
-
-
-def _stacked(path: Path, cells: npt.NDArray[Any], name: str) -> FloatArray:
-    rows = []
-    for number, cell in enumerate(cells):
-        record = cell.reshape(-1)[0] if isinstance(cell, np.ndarray) else cell
-        if getattr(record, "dtype", None) is None or record.dtype.names is None or name not in record.dtype.names:
-            raise InputError(path, f"scan {number} has no field '{name}'", f"a scan holds {', '.join(FIELDS)}")
-        rows.append(np.asarray(record[name], dtype=np.float64).reshape(-1))
-    sizes = {len(row) for row in rows}
-    wanted = {"t": 1, "res": 1, "pose": 3, "rpy": 3}.get(name)
-    if len(sizes) != 1 or wanted not in (None, *sizes) or sizes == {0}:
-        raise InputError(
-            path, f"field '{name}' has {sorted(sizes)} values", f"expected {wanted or 'one number of beams'}"
-        )
-    values = np.stack(rows)
-    if name != "scan" and not np.isfinite(values).all():
-        bad = int(np.argmax(~np.isfinite(values).all(axis=1)))
-        raise InputError(path, f"field '{name}' of scan {bad} is not finite", "repair the log")
-    return values
+def _joint_path(lidar_path: Path) -> Path:
+    """Return the joint file beside the LiDAR file, or in the folder `joint` beside its folder `lidar`."""
+    beside = lidar_path.with_name(re.sub("lidar", "joint", lidar_path.name, flags=re.IGNORECASE))
+    folder = lidar_path.resolve().parent
+    apart = folder.with_name("joint") / beside.name
+    if folder.name == "lidar" and apart.is_file() and not beside.is_file():
+        return apart
+    if not beside.is_file():
+        raise InputError(beside, "is missing", "the head's angles are needed to place the scans")
+    return beside
 
 
 def _truth(lidar_path: Path) -> Trajectory | None:

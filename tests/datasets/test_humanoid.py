@@ -116,6 +116,55 @@ def test_struct_arrays_are_read_like_cells(walk: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.ranges_m, second.ranges_m)
 
 
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same walk, upright, in the form of three fields: t, scan, delta_pose."""
+    return write_humanoid_log(tmp_path_factory.mktemp("steps"), rng=np.random.default_rng(0), scans=60, steps=True)
+
+
+def test_files_of_odometry_steps_are_read(steps: Path) -> None:
+    assert loadmat(steps)["lidar"][0, 5].dtype.names == ("t", "scan", "delta_pose")
+    log = datasets.read(steps)
+    assert log.scans is not None
+    assert log.truth is not None
+    assert log.scan_odometry is not None
+    T = log.truth.poses[20][np.ix_([0, 1, 3], [0, 1, 3])]
+    assert np.median(wall_distance(log.scans.points(20) @ T[:2, :2].T + T[:2, 2])) < 0.01
+    # The steps are differences of poses in the odometry's own frame: their sum is the odometry.
+    cells = loadmat(steps)["lidar"].reshape(-1)
+    summed = np.cumsum([cell["delta_pose"][0, 0].reshape(-1) for cell in cells], axis=0)
+    np.testing.assert_allclose(log.scan_odometry.poses, pose_from_xyt(summed), atol=1e-9)
+    assert any("no IMU angles" in remark for remark in log.remarks)
+
+
+@pytest.mark.parametrize("form", ["poses", "poses and one more", "steps"])
+def test_fields_of_other_names_are_known_by_their_order(walk: Path, steps: Path, tmp_path: Path, form: str) -> None:
+    source = steps if form == "steps" else walk
+    order = ("t", "scan", "delta_pose") if form == "steps" else ("t", "pose", "res", "rpy", "scan")
+    stored = loadmat(source)["lidar"].reshape(-1)
+    cells = np.empty((1, len(stored)), dtype=object)
+    for k, cell in enumerate(stored):
+        values = [cell[0, 0][name] for name in order]
+        values[1:1] = [np.zeros((1, 1))] * (form == "poses and one more")
+        cells[0, k] = {f"field{number}": value for number, value in enumerate(values)}
+    savemat(tmp_path / "lidar.mat", {"lidar": cells})
+    (tmp_path / "joint.mat").write_bytes(source.with_name("train_joint0.mat").read_bytes())
+    first, second = datasets.read(source), datasets.read(tmp_path / "lidar.mat")
+    assert first.scans is not None
+    assert second.scans is not None
+    np.testing.assert_array_equal(first.scans.ranges_m, second.scans.ranges_m)
+    assert first.scan_odometry is not None
+    assert second.scan_odometry is not None
+    np.testing.assert_array_equal(first.scan_odometry.poses, second.scan_odometry.poses)
+
+
+def test_joints_in_a_folder_of_their_own(walk: Path, tmp_path: Path) -> None:
+    for kind in ("lidar", "joint"):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / f"train_{kind}0.mat").write_bytes(walk.with_name(f"train_{kind}0.mat").read_bytes())
+    assert datasets.read(tmp_path / "lidar" / "train_lidar0.mat").scans is not None
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

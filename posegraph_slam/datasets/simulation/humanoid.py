@@ -23,16 +23,25 @@ NO_RETURN_M = 0.0
 
 
 def write_humanoid_log(
-    folder: Path, *, rng: np.random.Generator, scans: int = 200, beams: int = 1081, noise_m: float = 0.01
+    folder: Path,
+    *,
+    rng: np.random.Generator,
+    scans: int = 200,
+    beams: int = 1081,
+    noise_m: float = 0.01,
+    steps: bool = False,
 ) -> Path:
     """Write `train_lidar0.mat`, `train_joint0.mat` and `truth.tum` of a walk; return the path of the LiDAR file.
 
     The body walks an ellipse about the pillar, rolling and pitching with its steps while the head pans and nods far
     enough to see the ground. The odometry's yaw drifts, the IMU's does not; the joints have a clock of their own.
+    With `steps` the file has the form with `delta_pose`, which knows no IMU: the body then stays upright.
     """
     time = np.arange(scans) / RATE_HZ
     path = _walk(time)
     roll, pitch = 0.03 * np.sin(9 * time), 0.02 * np.cos(7 * time)
+    if steps:
+        roll, pitch = np.zeros(scans), np.zeros(scans)
     joint_time = np.arange(-0.05, time[-1] + 0.05, 0.0083) + 0.0011
     neck, head = 0.6 * np.sin(0.8 * joint_time), 0.15 + 0.15 * np.sin(0.5 * joint_time)
     nearest = np.abs(joint_time[None] - time[:, None]).argmin(axis=1)
@@ -45,13 +54,17 @@ def write_humanoid_log(
     odometry = _drifting(path, rng)
     cells = np.empty((1, scans), dtype=object)
     for k in range(scans):
-        cells[0, k] = {
-            "t": np.array([[START_S + time[k]]]),
-            "pose": odometry[k][None],
-            "res": np.array([[RESOLUTION_RAD]]),
-            "rpy": np.array([[roll[k], pitch[k], path[k, 2] + 1.0]]),  # the IMU's zero is anywhere
-            "scan": ranges[k][None],
-        }
+        common = {"t": np.array([[START_S + time[k]]]), "scan": ranges[k][None]}
+        if steps:
+            cells[0, k] = {**common, "delta_pose": odometry[k][None] - odometry[max(k - 1, 0)]}
+        else:
+            cells[0, k] = {
+                "t": common["t"],
+                "pose": odometry[k][None],
+                "res": np.array([[RESOLUTION_RAD]]),
+                "rpy": np.array([[roll[k], pitch[k], path[k, 2] + 1.0]]),  # the IMU's zero is anywhere
+                "scan": common["scan"],
+            }
     with replacing(folder / "train_lidar0.mat") as temporary:
         savemat(temporary, {"lidar": cells}, do_compression=True)
     with replacing(folder / "train_joint0.mat") as temporary:

@@ -1,0 +1,43 @@
+"""MATLAB files (version 5 to 7.2) as dictionaries, with errors that name the file."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
+
+from posegraph_slam.errors import InputError
+
+UNREADABLE = (
+    MatReadError,
+    ValueError,
+    TypeError,
+    OSError,
+    EOFError,
+    KeyError,
+    IndexError,
+    zlib.error,
+)
+
+
+def load_mat(path: Path) -> dict[str, Any]:
+    """Return the variables of a MATLAB file; raise InputError where it cannot be read."""
+    try:
+        content = dict(loadmat(path, squeeze_me=False))
+    except NotImplementedError as error:
+        raise InputError(path, "is a MATLAB 7.3 file", "save it in MATLAB by save -v7") from error
+    except UNREADABLE as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        problem = f"cannot be read as a MATLAB file ({reason})"
+        raise InputError(path, problem, "the file may be truncated: copy it again") from error
+    return {name: value for name, value in content.items() if not name.startswith("__")}
+
+
+def require(content: dict[str, Any], name: str, path: Path) -> Any:
+    """Return the variable `name` of a file's content; raise InputError naming what there is instead."""
+    if name not in content:
+        raise InputError(path, f"has no field '{name}'", f"it holds {', '.join(content) or 'nothing'}")
+    return content[name]
