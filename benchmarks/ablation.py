@@ -36,7 +36,13 @@ RESULTS, PAGE = ROOT / "benchmarks/results/ablation.json", ROOT / "docs/benchmar
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 
 REAL = {"intel": "carmen/intel.clf", "fr079": "carmen/fr079.clf", "ece276a/20": "ece276a/20"}
-SIMULATED = {"corridors": ("corridor_loop", 1.0, 1), "twin wings": ("twins_drift", 1.0, 3), "hall": ("hall", 1.0, 1)}
+SIMULATED = {
+    "corridors": ("corridor_loop", 1.0, 1),
+    "twin wings": ("twins_drift", 1.0, 3),
+    "hall": ("hall", 1.0, 1),
+    "crowd": ("hall_30m", 1.0, 1),
+    "slow sweep": ("sweep", 1.0, 1),
+}
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -44,6 +50,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "front end: one reference": ("scan_matching.references=1",),
     "front end: references in a row": ("scan_matching.reference_stride=1",),
     "front end: no window search": ("scan_matching.matched_fraction_min=0",),
+    "clocks not compared": ("timing.estimate=false",),
     "no odometry": ("odometry.source=none",),
     "no loop closure": ("loop_closure.enabled=false",),
     "loops: fixed interval only": ("loop_closure.proposals.proximity=false",),
@@ -57,6 +64,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "loops: no robust loss": ("pose_graph.robust.loss=none",),
     "no refinement": ("refinement.rounds=0",),
     "refinement: three rounds": ("refinement.rounds=3",),
+    "refinement: passers-by kept": ("refinement.seen_through_min=0",),
     "no smoothing": ("smoothing=false",),
 }
 

@@ -51,7 +51,7 @@ class Configuration(Settings):
     refinement: RefinementSettings = RefinementSettings()
     smoothing: bool = True
     """Smooth the poses of all scans with odometry from wheels, which is known at the scans' own stamps; poses that a
-    logger wrote beside the scans lag by an unknown part of a scan and would only bend the path."""
+    logger wrote beside the scans are too coarse in time and would only bend the path."""
     pose_graph: PoseGraphSettings = PoseGraphSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
     spatial: SpatialSettings = SpatialSettings()
     maps: bool = True
