@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.errors import ConfigurationError, InputError
 from posegraph_slam.geometry import SE2, Trajectory, planar_from_spatial
 from posegraph_slam.odometry.estimate import OdometryEstimate, diagonal_covariance, resample, step_covariance
 from posegraph_slam.odometry.settings import OdometrySettings, OdometrySource
 from posegraph_slam.odometry.wheel_imu import wheel_imu_odometry
 from posegraph_slam.sensors import RobotLog
+
+STILL = 1e-3
+"""A logged step shorter than this, in metres and radians, is one of odometry that stands still, or has stalled."""
+STALL_STEPS_MAX = 60
+"""Steps over which a leap is spread at most."""
 
 
 def odometry_at_scans(log: RobotLog, settings: OdometrySettings | None = None) -> OdometryEstimate:
@@ -75,11 +80,10 @@ def _from_poses(log: RobotLog, trajectory: Trajectory, settings: OdometrySetting
     bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
     if len(bad):
         raise InputError(log.path, f"odometry pose {bad[0]} is not finite ({len(bad)} in all)", "drop these scans")
-    xi = SE2.log(SE2.between(poses[:-1], poses[1:]))
-    distance, turn = np.hypot(xi[:, 0], xi[:, 1]), np.abs(xi[:, 2])
-    covariance = step_covariance(distance, turn, settings.logged_noise)
+    distance, turn = _lengths(poses)
     leap = (distance > settings.leap_m) | (turn > settings.leap_rad)
-    covariance[leap] += diagonal_covariance(distance[leap] ** 2, turn[leap] ** 2)
+    poses, unsure = _spread_leaps(poses, np.flatnonzero(leap), np.maximum(distance, turn) < STILL)
+    covariance = step_covariance(*_lengths(poses), settings.logged_noise) + unsure
     remark = f"the logged odometry leaps {leap.sum()} times by metres or tens of degrees in one step"
     return OdometryEstimate(
         trajectory=Trajectory(stamps_s=trajectory.stamps_s, poses=poses, parent="odom", child="base"),
@@ -87,6 +91,30 @@ def _from_poses(log: RobotLog, trajectory: Trajectory, settings: OdometrySetting
         source="logged",
         remarks=(remark,) if leap.any() else (),
     )
+
+
+def _lengths(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return distance and turn (N-1,) of the steps between poses (N, 3, 3)."""
+    xi = SE2.log(SE2.between(poses[:-1], poses[1:]))
+    return np.hypot(xi[:, 0], xi[:, 1]), np.abs(xi[:, 2])
+
+
+def _spread_leaps(poses: FloatArray, leaps: IntArray, still: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Spread each of the steps `leaps` evenly over the `still` steps before it, during which odometry had stalled.
+
+    Returns the poses (N, 3, 3) and what is to be added to the covariance of the steps (N-1, 3, 3): a leap and the
+    steps over which it was spread share a variance of its own size.
+    """
+    poses, unsure = poses.copy(), np.zeros((len(still), 3, 3))
+    for leap in leaps:
+        moving = np.flatnonzero(~still[max(leap - STALL_STEPS_MAX, 0) : leap])
+        first = max(leap - STALL_STEPS_MAX, 0) + (int(moving[-1]) + 1 if len(moving) else 0)
+        count = int(leap) + 1 - first
+        motion = SE2.log(SE2.between(poses[first], poses[leap + 1])[None])
+        share = np.arange(1, count)[:, None] / count
+        poses[first + 1 : leap + 1] = SE2.retract(poses[[first] * (count - 1)], share * motion)
+        unsure[first : leap + 1] = diagonal_covariance(motion[:, 0] ** 2 + motion[:, 1] ** 2, motion[:, 2] ** 2) / count
+    return poses, unsure
 
 
 def resample_at_scans(estimate: OdometryEstimate, stamps: FloatArray, settings: OdometrySettings) -> OdometryEstimate:

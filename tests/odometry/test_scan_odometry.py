@@ -160,6 +160,17 @@ def test_a_leap_of_the_logged_odometry_is_hardly_believed() -> None:
     assert estimate.covariance[0, 2, 2] < 0.01
 
 
+def test_a_leap_is_spread_over_the_stall_before_it() -> None:
+    xyt = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0, 0], [0.1, 0, 0], [0.1, 0, 0], [0.9, 0.0, 1.2], [1.0, 0, 1.2]])
+    estimate = odometry_at_scans(logged(np.arange(7.0), xyt))
+    steps = SE2.log(estimate.steps)
+    np.testing.assert_allclose(steps[1:5], np.broadcast_to(steps[1], (4, 3)), atol=1e-12)
+    np.testing.assert_allclose(steps[1, 2], 0.3)
+    np.testing.assert_allclose(estimate.trajectory.poses[[0, 1, 5, 6]], pose_from_xyt(xyt[[0, 1, 5, 6]]), atol=1e-12)
+    assert estimate.covariance[1:5, 2, 2] == pytest.approx(1.2**2 / 4, rel=0.05)
+    assert estimate.covariance[0, 2, 2] < 0.01
+
+
 def test_spatial_logged_poses_are_taken_in_the_plane() -> None:
     log = logged(np.arange(3.0), np.array([[0, 0, 0], [1, 2, 0.5], [2, 2, 1.0]]))
     assert log.scan_odometry is not None
