@@ -17,6 +17,7 @@ from posegraph_slam.cli import (
     configuration,
     conversion,
     datasets,
+    evaluating,
     inspection,
     localization,
     optimisation,
@@ -99,6 +100,8 @@ app.command("pf-slam", short_help="Map a log with a particle filter.")(particle_
 app.command("simulate", short_help="Write a simulated log with its truth.")(simulation.simulate)
 app.command("attitude", short_help="Estimate orientation from an IMU.")(attitude.attitude)
 app.command("convert", short_help="Write a trajectory or log in another format.")(conversion.convert)
+app.command("evaluate", short_help="Measure a trajectory against the truth.")(evaluating.evaluate)
+app.command("compare", short_help="Put several runs side by side.")(evaluating.compare)
 app.command("datasets", short_help="List the formats that can be read.")(datasets.datasets)
 app.add_typer(configuration.app, name="config", short_help="List presets, show the configuration.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -38,3 +39,16 @@ def topic_names(options: list[str] | None) -> dict[str, str]:
     from posegraph_slam.datasets.rosbag.topics import parse_topics
 
     return parse_topics(options or [])
+
+
+def choice(option: str, value: str, allowed: Sequence[str]) -> str:
+    """Return `value` if it is allowed; else raise InputError that names the nearest one and all others."""
+    import difflib
+
+    from posegraph_slam.errors import InputError
+
+    if value in allowed:
+        return value
+    near = difflib.get_close_matches(value.lower(), allowed, n=1, cutoff=0.4)
+    guess = f"did you mean '{near[0]}'? " if near else ""
+    raise InputError(option, f"'{value}' is not known", f"{guess}it is {', '.join(allowed)}")

@@ -49,6 +49,14 @@ def paired_poses(
 
     Raises InputError when fewer than `minimum` stamps pair.
     """
+    _, poses, true = paired(estimate, reference, max_dt_s=max_dt_s, minimum=minimum)
+    return poses, true
+
+
+def paired(
+    estimate: Trajectory, reference: Trajectory, *, max_dt_s: float, minimum: int
+) -> tuple[Pairs, FloatArray, FloatArray]:
+    """Return the pairs and the poses that `paired_poses` returns."""
     pairs = pair_nearest(estimate.stamps_s, reference.stamps_s, max_dt_s=max_dt_s)
     if len(pairs) < minimum:
         raise InputError(
@@ -58,8 +66,8 @@ def paired_poses(
         )
     if estimate.group is SE2:
         true = reference.poses if reference.group is SE2 else planar_from_spatial(reference.poses)
-        return estimate.poses[pairs.estimate], true[pairs.reference]
-    return estimate.poses[pairs.estimate], reference.spatial().poses[pairs.reference]
+        return pairs, estimate.poses[pairs.estimate], true[pairs.reference]
+    return pairs, estimate.poses[pairs.estimate], reference.spatial().poses[pairs.reference]
 
 
 def rotation_angle_deg(poses: FloatArray) -> FloatArray:

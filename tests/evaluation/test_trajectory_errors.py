@@ -45,17 +45,19 @@ def assert_same(ours: object, theirs: metrics.PE) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("alignment", ["none", "origin", "auto"])
+@pytest.mark.parametrize("alignment", ["none", "origin", "first", "auto", "sim3"])
 @pytest.mark.parametrize("seed", range(3))
 def test_absolute_error_is_that_of_evo(seed: int, alignment: Alignment, dimension: int) -> None:
     estimate, true = pair_of_trajectories(seed, dimension)
     reference, aligned = evo_pair(estimate, true)
-    if alignment == "origin":
+    if alignment in ("origin", "first"):
         aligned.align_origin(reference)
+    if alignment == "sim3":
+        aligned.align(reference, correct_scale=True)
     if alignment == "auto":
         aligned.align(reference)
     ours = absolute_pose_error(estimate, true, alignment=alignment)
-    assert ours.alignment == (alignment if alignment != "auto" else f"se{dimension}")
+    assert ours.alignment == {"auto": f"se{dimension}", "first": "origin"}.get(alignment, alignment)
     assert ours.paired == len(true)
     for relation, statistics in (
         (metrics.PoseRelation.translation_part, ours.translation_m),
