@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc, chdtri
 
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.geometry import SE2, Group
@@ -16,6 +16,8 @@ from posegraph_slam.loop_closure.settings import VerificationSettings
 
 NEIGHBOURHOOD_M = 15.0
 """Candidates whose ends lie within this travel of each other are compared for consistency."""
+RAREST = 1e-300
+"""Tail probabilities below this would make sigmas infinite."""
 
 Apart = Callable[[IntArray, IntArray, FloatArray], BoolArray]
 """Tells which pairs of keyframes i and j (M,), `distance_m` (M,) apart in the plan view, cannot be one place."""
@@ -123,11 +125,9 @@ def first_reasons(earlier: list[str], later: list[str]) -> list[str]:
 
 def gaussian_sigmas(chi2: FloatArray, dof: int) -> FloatArray:
     """Turn chi-squares (M,) of `dof` dimensions into the sigmas at which a Gaussian is as rare."""
-    log_tail = chi2_distribution.logsf(chi2, dof)
-    return np.asarray(np.sqrt(chi2_distribution.isf(np.exp(np.maximum(log_tail, -690.0)), 1)))
+    return np.asarray(np.sqrt(chdtri(1, np.maximum(chdtrc(dof, chi2), RAREST))))
 
 
 def chi2_gate(sigma: float, dof: int) -> float:
     """Return the chi-square that a right constraint of `dof` dimensions exceeds as rarely as a Gaussian `sigma`s."""
-    tail = chi2_distribution.sf(sigma**2, 1)
-    return float(chi2_distribution.isf(tail, dof))
+    return float(chdtri(dof, chdtrc(1, sigma**2)))

@@ -10,7 +10,7 @@ import json
 import tomllib
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -76,14 +76,16 @@ def build_settings(model: type[Model], layers: Sequence[Layer], *, listing: str 
     """
     # all defaults are written out, since a section's own defaults may differ from those of its class
     values, sources = model().model_dump(mode="json"), dict[str, str]()
+    fields, sections = {name: info for name, info, _ in walk_fields(model)}, dict(walk_sections(model))
     for layer in layers:
         for dotted, value in _flatten(model, layer.values):
-            info = _find(model, layer.source, dotted, listing)
+            if dotted not in fields:
+                raise _no_such_field(layer.source, dotted, fields, sections, listing)
             *parents, last = dotted.split(".")
             section = values
             for parent in parents:
                 section = section[parent]
-            section[last] = None if value == UNSET and _is_optional(info) else value
+            section[last] = None if value == UNSET and _is_optional(fields[dotted]) else value
             sources[dotted] = layer.source
     try:
         return model.model_validate_json(json.dumps(values, default=str), strict=True)
@@ -101,18 +103,16 @@ def _flatten(model: type[Settings], values: Mapping[str, Any], prefix: str = "")
             yield f"{prefix}{key}", value
 
 
-def _find(model: type[Settings], source: str, dotted: str, listing: str) -> FieldInfo:
-    """Return the field called `dotted`, or raise an error that says what is near it."""
-    fields = {name: info for name, info, _ in walk_fields(model)}
-    sections = dict(walk_sections(model))
+def _no_such_field(
+    source: str, dotted: str, fields: Iterable[str], sections: Mapping[str, type[Settings]], listing: str
+) -> ConfigurationError:
+    """Say that `dotted` is no field, and what is near it."""
     if dotted in sections:
         known = ", ".join(f"{dotted}.{name}" for name in sections[dotted].model_fields)
-        raise ConfigurationError(source, f"'{dotted}' is a section, not a value", f"its keys are {known}")
-    if dotted not in fields:
-        near = _nearest(dotted, [*fields, *sections])
-        remedy = f"did you mean '{near}'?" if near else f"`{listing}` lists every key"
-        raise ConfigurationError(source, f"unknown key '{dotted}'", remedy)
-    return fields[dotted]
+        return ConfigurationError(source, f"'{dotted}' is a section, not a value", f"its keys are {known}")
+    near = _nearest(dotted, [*fields, *sections])
+    remedy = f"did you mean '{near}'?" if near else f"`{listing}` lists every key"
+    return ConfigurationError(source, f"unknown key '{dotted}'", remedy)
 
 
 def _nearest(dotted: str, known: Sequence[str]) -> str | None:

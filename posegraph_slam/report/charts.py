@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtr
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.pipeline.stored_graph import StoredGraph
@@ -65,7 +64,7 @@ def residual_histograms(stored: StoredGraph) -> Markup:
     )
     squared = {name: each.chi2 for name, each in by_origin.items()}
     figures = [histogram(title, unit, values, linear_axis(values, unit)) for title, unit, values in metric]
-    figures.append(histogram("χ²", "", squared, decade_axis(), expected=chi2_distribution(dof)))
+    figures.append(histogram("χ²", "", squared, decade_axis(), expected=lambda edges: np.asarray(chdtr(dof, edges))))
     return element("div", *figures, class_="charts")
 
 
@@ -94,15 +93,20 @@ def decade_axis() -> Axis:
 
 
 def histogram(
-    title: str, unit: str, values: Mapping[str, FloatArray], axis: Axis, *, expected: Any | None = None
+    title: str,
+    unit: str,
+    values: Mapping[str, FloatArray],
+    axis: Axis,
+    *,
+    expected: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Markup:
-    """Draw one panel; `expected` is the distribution that right noise models would give, drawn as a line."""
+    """Draw one panel; `expected` is the distribution function that right noise models would give, drawn as a line."""
     low, high = float(axis.edges[0]), float(axis.edges[-1])
     shares = {
         name: np.histogram(np.clip(each, low, high * (1 - 1e-9)), bins=axis.edges)[0] / max(len(each), 1)
         for name, each in values.items()
     }
-    line = np.diff(expected.cdf(axis.edges)) if expected is not None else np.zeros(0)
+    line = np.diff(expected(axis.edges)) if expected is not None else np.zeros(0)
     peak = max(*(float(share.max()) for share in shares.values()), float(line.max(initial=0.0)), 1e-9)
     drawn = [
         element("path", d=_steps(share / peak), class_=f"area origin-{number}")
