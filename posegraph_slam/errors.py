@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -26,3 +28,9 @@ class ConfigurationError(InputError):
 
 class GraphError(InputError):
     """A pose graph cannot be solved: disconnected, without gauge, not finite or indefinite."""
+
+
+def did_you_mean(word: str, known: Iterable[str], *, cutoff: float = 0.5) -> str:
+    """Return "did you mean 'X'? " for the known word nearest to one that is not known, nothing where none is near."""
+    near = difflib.get_close_matches(word.lower(), list(known), n=1, cutoff=cutoff)
+    return f"did you mean '{near[0]}'? " if near else ""

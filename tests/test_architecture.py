@@ -33,6 +33,7 @@ HOMES = {
     "matplotlib": ("report/",),
     "dask": ("pipeline/",),
     "distributed": ("pipeline/",),
+    "rerun": ("report/viewer.py",),
     "rosbags": ("datasets/rosbag/",),
     "cv2": (
         "datasets/rosbag/images.py",

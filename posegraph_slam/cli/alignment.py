@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Json, Quiet
+from posegraph_slam.cli.arguments import Json, Quiet, Verbose
 from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table, print_warning
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def icp(
     keep: Keep = 0.9,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Align clouds with the model of an object, without a guess: T_model_cloud of each.
 

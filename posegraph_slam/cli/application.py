@@ -25,6 +25,7 @@ from posegraph_slam.cli import (
     reporting,
     simulation,
     solving,
+    viewing,
 )
 from posegraph_slam.errors import PosegraphSlamError
 
@@ -68,7 +69,6 @@ app = typer.Typer(
     name="psg",
     cls=Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -102,6 +102,7 @@ app.command("attitude", short_help="Estimate orientation from an IMU.")(attitude
 app.command("convert", short_help="Write a trajectory or log in another format.")(conversion.convert)
 app.command("evaluate", short_help="Measure a trajectory against the truth.")(evaluating.evaluate)
 app.command("compare", short_help="Put several runs side by side.")(evaluating.compare)
+app.command("view", short_help="Show a run in the rerun viewer.")(viewing.view)
 app.command("datasets", short_help="List the formats that can be read.")(datasets.datasets)
 app.add_typer(configuration.app, name="config", short_help="List presets, show the configuration.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -31,7 +32,27 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an ea
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Run directory.")]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print remarks and the time of each stage too.")]
+
+
+def _tell_at_the_end(context: typer.Context, wanted: bool) -> bool:
+    """Print on stderr, when the command ends, how long it took and how much memory it needed."""
+    if wanted:
+        began = time.perf_counter()
+
+        def tell() -> None:
+            from posegraph_slam.cli.console import print_note
+            from posegraph_slam.pipeline.run_record import peak_memory_mib
+
+            print_note(f"{time.perf_counter() - began:.2f} s, at most {peak_memory_mib():.0f} MiB of memory")
+
+        context.call_on_close(tell)
+    return wanted
+
+
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Print more: remarks, times and memory.", callback=_tell_at_the_end),
+]
 
 
 def topic_names(options: list[str] | None) -> dict[str, str]:
@@ -43,12 +64,9 @@ def topic_names(options: list[str] | None) -> dict[str, str]:
 
 def choice(option: str, value: str, allowed: Sequence[str]) -> str:
     """Return `value` if it is allowed; else raise InputError that names the nearest one and all others."""
-    import difflib
-
-    from posegraph_slam.errors import InputError
+    from posegraph_slam.errors import InputError, did_you_mean
 
     if value in allowed:
         return value
-    near = difflib.get_close_matches(value.lower(), allowed, n=1, cutoff=0.4)
-    guess = f"did you mean '{near[0]}'? " if near else ""
+    guess = did_you_mean(value, allowed, cutoff=0.4)
     raise InputError(option, f"'{value}' is not known", f"{guess}it is {', '.join(allowed)}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from posegraph_slam.cli.arguments import Format, Json, Overwrite, Quiet, Topic, topic_names
+from posegraph_slam.cli.arguments import Format, Json, Overwrite, Quiet, Topic, Verbose, topic_names
 from posegraph_slam.cli.console import print_json, print_note, print_table
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def attitude(
     overwrite: Overwrite = False,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Estimate the orientation at every IMU stamp, and compare it with the truth where the log has it."""
     from posegraph_slam.datasets import read

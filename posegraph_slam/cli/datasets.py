@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from posegraph_slam.cli.arguments import Json
+from posegraph_slam.cli.arguments import Json, Quiet, Verbose
 from posegraph_slam.cli.console import print_json
 
 
-def datasets(as_json: Json = False) -> None:
+def datasets(as_json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """List the formats of logs that can be read."""
     import typer
 
@@ -15,6 +15,7 @@ def datasets(as_json: Json = False) -> None:
     readers = available_readers()
     if as_json:
         print_json([{"name": each.name, "description": each.description, "layout": each.layout} for each in readers])
+    if as_json or quiet:
         return
     for reader in readers:
         typer.secho(reader.name, bold=True)

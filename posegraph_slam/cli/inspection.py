@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Set, Topic, topic_names
+from posegraph_slam.cli.arguments import Config, Format, Json, Log, Quiet, Set, Topic, Verbose, topic_names
 from posegraph_slam.cli.console import print_json, print_table, print_warning
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ def inspect(
     config: Config = None,
     settings: Set = None,
     as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Show the streams of a log, what is suspicious in it, and what `psg optimize` would do with it."""
     from posegraph_slam.datasets import read
@@ -33,6 +35,7 @@ def inspect(
     plan = describe(robot_log, configuration)
     if as_json:
         print_json({**inspection.as_dict(), "plan": plan})
+    if as_json or quiet:
         return
     print_inspection(inspection)
     typer.secho("\npsg optimize would", bold=True)

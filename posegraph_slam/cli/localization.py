@@ -7,7 +7,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set, Topic, topic_names
+from posegraph_slam.cli.arguments import (
+    Config,
+    Format,
+    Json,
+    Log,
+    Out,
+    Overwrite,
+    Quiet,
+    Seed,
+    Set,
+    Topic,
+    Verbose,
+    topic_names,
+)
 from posegraph_slam.cli.console import ProgressBars
 from posegraph_slam.cli.runs import report
 
@@ -33,6 +46,7 @@ def localize(
     seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
     """Find a robot in a known map at every scan of its log, and say when its pose is not known."""

@@ -4,7 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from posegraph_slam.cli.arguments import Config, Format, Json, Log, Out, Overwrite, Quiet, Seed, Set, Topic, topic_names
+from posegraph_slam.cli.arguments import (
+    Config,
+    Format,
+    Json,
+    Log,
+    Out,
+    Overwrite,
+    Quiet,
+    Seed,
+    Set,
+    Topic,
+    Verbose,
+    topic_names,
+)
 from posegraph_slam.cli.console import ProgressBars, print_table
 from posegraph_slam.cli.runs import report
 
@@ -22,6 +35,7 @@ def pf_slam(
     seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
     """Map a log with a particle filter: no graph, no loop closures; a baseline, and a way to learn."""

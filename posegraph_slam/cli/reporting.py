@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Json, Quiet
+from posegraph_slam.cli.arguments import Json, Quiet, Verbose
 from posegraph_slam.cli.console import print_json
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Run directory, made by psg optimize or another command.")]
@@ -20,6 +20,7 @@ def report(
     ] = None,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Show a run in one HTML file that needs no network: comparison, interactive map, closures, residuals, times."""
     from posegraph_slam.errors import InputError

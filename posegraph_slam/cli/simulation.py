@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Overwrite, Quiet, Set
+from posegraph_slam.cli.arguments import Overwrite, Quiet, Set, Verbose
 from posegraph_slam.cli.console import ProgressBars
 
 
@@ -33,6 +33,7 @@ def simulate(
     overwrite: Overwrite = False,
     show: Annotated[bool, typer.Option("--show-settings", help="Print all settings as TOML and stop.")] = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Write the log of a simulated robot, with its truth, as a folder that `psg optimize` reads."""
     from posegraph_slam.datasets.simulation import SimulationSettings

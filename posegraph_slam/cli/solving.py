@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from posegraph_slam.cli.arguments import Json, Quiet
+from posegraph_slam.cli.arguments import Json, Quiet, Verbose
 from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table, print_warning
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def solve(
     relative: Relative = None,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Solve a pose graph and prove the solution optimal.
 

@@ -6,7 +6,6 @@ a reader through the entry-point group `posegraph_slam.readers`; each entry poin
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import warnings
 from collections.abc import Callable, Mapping
@@ -15,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from posegraph_slam.errors import InputError
+from posegraph_slam.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from posegraph_slam.sensors import RobotLog
@@ -158,8 +157,7 @@ def _named(name: str, readers: tuple[Reader, ...]) -> Reader:
     by_name = {reader.name: reader for reader in readers}
     if name in by_name:
         return by_name[name]
-    near = difflib.get_close_matches(name.lower(), by_name, n=1, cutoff=0.5)
-    guess = f"did you mean '{near[0]}'? " if near else ""
+    guess = did_you_mean(name, by_name)
     raise InputError("format", f"unknown format '{name}'", f"{guess}available: {', '.join(by_name)}")
 
 

@@ -13,7 +13,7 @@ from posegraph_slam.arrays import FloatArray
 from posegraph_slam.datasets.csv_table import read_csv
 from posegraph_slam.datasets.number_text import read_table, refuse_first
 from posegraph_slam.datasets.tum import read_tum, write_tum
-from posegraph_slam.errors import InputError
+from posegraph_slam.errors import InputError, did_you_mean
 from posegraph_slam.files import replacing
 from posegraph_slam.geometry import Trajectory, pose_from_rotation_translation
 
@@ -93,7 +93,9 @@ def format_of_suffix(path: Path) -> str | None:
 
 def _known(name: str) -> str:
     if name not in TRAJECTORY_FORMATS:
-        raise InputError("format", f"unknown trajectory format '{name}'", f"it is {', '.join(TRAJECTORY_FORMATS)}")
+        guess = did_you_mean(name, TRAJECTORY_FORMATS)
+        remedy = f"{guess}it is {', '.join(TRAJECTORY_FORMATS)}"
+        raise InputError("format", f"unknown trajectory format '{name}'", remedy)
     return name
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from posegraph_slam.errors import ConfigurationError
+from posegraph_slam.errors import ConfigurationError, did_you_mean
 from posegraph_slam.localization.settings import LocalizationSettings
 from posegraph_slam.localization.slam_settings import ParticleSlamSettings
 from posegraph_slam.loop_closure.refinement import RefinementSettings
@@ -91,7 +91,8 @@ def find_configuration(name: str | Path) -> Path:
         return presets[str(name)]
     if path.is_file():
         return path
-    raise ConfigurationError(name, "is neither a file nor a preset", f"the presets are {', '.join(presets)}")
+    guess = did_you_mean(str(name), presets)
+    raise ConfigurationError(name, "is neither a file nor a preset", f"{guess}the presets are {', '.join(presets)}")
 
 
 def load_configuration(

@@ -19,7 +19,7 @@ from posegraph_slam.datasets.trajectory_files import (
     read_trajectory,
     write_trajectory,
 )
-from posegraph_slam.errors import InputError
+from posegraph_slam.errors import InputError, did_you_mean
 from posegraph_slam.geometry import Trajectory
 from posegraph_slam.odometry.scan_odometry import chosen_source, odometry_at_scans
 from posegraph_slam.pipeline.run_directory import RECORD
@@ -94,7 +94,8 @@ def target_format(target: Path, to: str | None) -> str:
     """Return the format to write; InputError where neither `to` nor the suffix names one."""
     if to is not None:
         if to not in TARGETS:
-            raise InputError("--to", f"'{to}' is no format that is written", f"it is {', '.join(TARGETS)}")
+            remedy = f"{did_you_mean(to, TARGETS)}it is {', '.join(TARGETS)}"
+            raise InputError("--to", f"'{to}' is no format that is written", remedy)
         return to
     name = format_of_suffix(target) or LOG_SUFFIXES.get(target.suffix.lower())
     if name is None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from posegraph_slam.errors import ConfigurationError, InputError
+from posegraph_slam.errors import ConfigurationError, InputError, did_you_mean
 from posegraph_slam.pipeline.configuration import Configuration, load_configuration
 from posegraph_slam.pipeline.run_directory import CONFIGURATION, read_run_directory
 
@@ -53,7 +53,11 @@ def plan_run(
     if start is None:
         return RunPlan(log=log, configuration=load_configuration(files, overrides, seed=seed, workers=workers))
     if start not in STARTS:
-        raise ConfigurationError("--from", f"'{start}' is not a stage to start from", f"it is {' or '.join(STARTS)}")
+        raise ConfigurationError(
+            "--from",
+            f"'{start}' is not a stage to start from",
+            f"{did_you_mean(start, STARTS)}it is {' or '.join(STARTS)}",
+        )
     run = read_run_directory(log)
     source = Path(run.record["input"]["path"])
     if not source.exists():
@@ -74,5 +78,7 @@ def _switches(stages: str | None) -> list[str]:
     wanted = [name.strip() for name in stages.split(",")]
     unknown = [name for name in wanted if name not in STAGE_SWITCHES]
     if unknown:
-        raise ConfigurationError("--stages", f"'{unknown[0]}' is not a stage", f"they are {', '.join(STAGE_SWITCHES)}")
+        guess = did_you_mean(unknown[0], STAGE_SWITCHES)
+        remedy = f"{guess}they are {', '.join(STAGE_SWITCHES)}"
+        raise ConfigurationError("--stages", f"'{unknown[0]}' is not a stage", remedy)
     return [key for name, keys in STAGE_SWITCHES.items() if name not in wanted for key in keys]

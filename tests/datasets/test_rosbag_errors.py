@@ -32,7 +32,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_missing_topic_lists_what_is_there(bag: Path) -> None:
     text = refused(bag, scan="/scann")
-    assert "no topic /scann for 'scan'; did you mean /scan?" in text
+    assert "no topic /scann for 'scan'; did you mean '/scan'?" in text
     assert "/chatter (String, 20)" in text
     assert "/odom (Odometry, 20)" in text
 

@@ -92,5 +92,5 @@ def test_inspect_prints_the_topics(robot: tuple[Path, Path]) -> None:
     assert "also there: /front/scan" in result.stdout
     wrong = psg("inspect", bag, "--topic", "scan=/rear/scans")
     assert wrong.exit_code == 2
-    assert "did you mean /rear/scan?" in wrong.stderr
+    assert "did you mean '/rear/scan'?" in wrong.stderr
     assert wrong.stderr.count("\n") == 1

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from posegraph_slam.datasets.rosbag.bag import Bag, Topic
-from posegraph_slam.errors import InputError
+from posegraph_slam.errors import InputError, did_you_mean
 
 LASER, ECHOES, CLOUD = (f"sensor_msgs/msg/{name}" for name in ("LaserScan", "MultiEchoLaserScan", "PointCloud2"))
 ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
@@ -68,8 +67,7 @@ def parse_topics(texts: Sequence[str]) -> dict[str, str]:
         if not equals or not name:
             raise InputError(f"--topic {text}", "is not of the form ROLE=NAME", "for example --topic scan=/front/scan")
         if role not in known:
-            near = difflib.get_close_matches(role.lower(), known, n=1, cutoff=0.4)
-            guess = f"did you mean '{near[0]}'? " if near else ""
+            guess = did_you_mean(role, known, cutoff=0.4)
             raise InputError(f"--topic {text}", f"'{role}' is no role", f"{guess}roles are {', '.join(known)}")
         chosen[role] = name
     return chosen
@@ -113,8 +111,7 @@ def unused(bag: Bag, choice: Choice) -> list[Topic]:
 def _named(bag: Bag, role: str, name: str) -> Topic:
     topic = bag.topics.get(name) or bag.topics.get(f"/{name}")
     if topic is None:
-        near = difflib.get_close_matches(name, bag.topics, n=1, cutoff=0.5)
-        guess = f"did you mean {near[0]}? " if near else ""
+        guess = did_you_mean(name, bag.topics)
         raise InputError(bag.path, f"has no topic {name} for '{role}'", f"{guess}it holds {bag.listing()}")
     if topic.type not in ROLES[role]:
         fitting = ", ".join(kind.rsplit("/", 1)[-1] for kind in ROLES[role])
