@@ -195,6 +195,11 @@ def render_colour(view: View, world: World, floor: FloorTexture, xyt: FloatArray
     return image
 
 
+def expose(image: ByteArray, gain: float) -> ByteArray:
+    """Return an RGB image as it comes out with another exposure; bright colours saturate at 255."""
+    return np.asarray(np.minimum(np.rint(image * gain), 255), dtype=np.uint8)
+
+
 def disparity_image(
     depth: FloatArray, calibration: DisparityCalibration, settings: KinectSettings, rng: np.random.Generator
 ) -> npt.NDArray[np.uint16]:

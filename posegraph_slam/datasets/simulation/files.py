@@ -110,8 +110,10 @@ def _write_images(run: SimulatedRun, folder: Path, progress: Progress) -> FloorT
         _write_png(folder / "dataRGBD" / f"Disparity{n}" / f"disparity{n}_{k}.png", disparity)
         progress("frames", k, total)
     view = camera.colour_view(calibration)
+    change = generator(run.settings, "exposure").uniform(-1.0, 1.0, size=len(run.colour_times_s))
     for k, xyt in enumerate(run.motion.xyt_at(run.colour_times_s), start=1):
         colours = camera.render_colour(view, run.world, floor, xyt)
+        colours = camera.expose(colours, 1.0 + settings.exposure_change * change[k - 1])
         _write_png(folder / "dataRGBD" / f"RGB{n}" / f"rgb{n}_{k}.png", colours[..., ::-1])
         progress("frames", len(run.disparity_times_s) + k, total)
     return floor

@@ -111,6 +111,7 @@ class KinectSettings(Settings):
     sigma_disparity: float = Field(0.3, ge=0, le=10, description="Noise of one disparity, in its own unit")
     range_min_m: float = Field(0.5, gt=0, description="Nothing nearer than this has a disparity")
     range_max_m: float = Field(6.0, gt=0, le=50, description="Nothing farther than this has a disparity")
+    exposure_change: float = Field(0.0, ge=0, lt=1, description="Colour frames are up to this share brighter or darker")
     floor_resolution_m: float = Field(0.02, gt=0, le=1, description="Cell of the floor's texture and of floor.png")
 
     @model_validator(mode="after")
