@@ -149,14 +149,16 @@ def label_ground(
     return labels
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HeightBand:
-    """Labels as floor the pixels between two heights in the map and two depths; higher ones are obstacles.
+    """Labels as floor the pixels between two heights over the base and two depths; higher ones are obstacles.
 
-    `tilt_rad` lifts both heights in proportion to the depth, for a robot that tilts unnoticed.
+    `T_base_camera` (4, 4) mounts the camera, so that the floor rises with the robot where its path has a third
+    dimension. `tilt_rad` lifts both heights in proportion to the depth, for a robot that tilts unnoticed.
     Source: course report, section III.E, which colours everything below 0.3 m.
     """
 
+    T_base_camera: FloatArray
     depths_m: tuple[float, float]
     heights_m: tuple[float, float]
     tilt_rad: float = 0.0
@@ -167,10 +169,10 @@ class HeightBand:
         return self.depths_m[1]
 
     def labels(self, depth_m: Float32Array, view: DepthView, T_map_camera: FloatArray, number: int) -> ByteArray:
-        """Return the labels (H, W) of a frame seen from `T_map_camera` (4, 4); its number does not matter."""
+        """Return the labels (H, W) of a frame; its number and its pose do not matter."""
         labels = np.empty(depth_m.shape, dtype=np.uint8)
         heights = *self.heights_m, EVERYWHERE
-        _label_by_plane(depth_m, view, T_map_camera[2], self.depths_m, heights, 0, labels, self.tilt_rad)
+        _label_by_plane(depth_m, view, self.T_base_camera[2], self.depths_m, heights, 0, labels, self.tilt_rad)
         return labels
 
 

@@ -36,12 +36,12 @@ class TextureSettings(Settings):
     resolution_m: float = Field(0.05, gt=0, le=10)
     """Side of a cell, where the map does not share the occupancy map's cells."""
     floor_height_m: float = Field(0.03, ge=-10, le=10)
-    """Points below this height in the map frame are floor. Where floor.method is set, its verdict on every pixel takes
-    the place of heights and depths."""
+    """Points below this height over the robot's base are floor. Where floor.method is set, its verdict on every pixel
+    takes the place of heights and depths."""
     floor_tilt_rad: float = Field(0.026, ge=0, le=0.5)
     """Rise of that height with depth: floor seen from a robot that tilts by 1.5 degrees unnoticed is still floor."""
     floor_depth_m: float = Field(0.5, gt=0, le=100)
-    """Points farther than this below the map's plane are taken for reflections and left out."""
+    """Points farther than this below the base's plane are taken for reflections and left out."""
     min_depth_m: float = Field(0.4, ge=0, le=100)
     """Smallest depth; the sensor sees nothing nearer, and a disparity of zero means 0.31 m."""
     max_depth_m: float = Field(4.0, gt=0, le=100)
@@ -122,7 +122,7 @@ def build_texture(
     painter = Painter(
         geometry=geometry,
         calibration=frames.calibration,
-        labels=labeller or _heights(settings),
+        labels=labeller or _heights(settings, frames),
         uniform=settings.weighting == "uniform",
         stride=settings.pixel_stride,
         min_pixels=settings.min_pixels,
@@ -176,8 +176,9 @@ def _texture_map(
     )
 
 
-def _heights(settings: TextureSettings) -> HeightBand:
+def _heights(settings: TextureSettings, frames: RgbdFrames) -> HeightBand:
     return HeightBand(
+        T_base_camera=frames.T_base_camera,
         depths_m=(settings.min_depth_m, settings.max_depth_m),
         heights_m=(-settings.floor_depth_m, settings.floor_height_m),
         tilt_rad=settings.floor_tilt_rad,

@@ -16,6 +16,7 @@ from posegraph_slam.localization.settings import LocalizationSettings
 from posegraph_slam.localization.slam_settings import ParticleSlamSettings
 from posegraph_slam.loop_closure.refinement import RefinementSettings
 from posegraph_slam.loop_closure.settings import LoopClosureSettings
+from posegraph_slam.mapping.floor_settings import FloorSettings
 from posegraph_slam.mapping.occupancy import OccupancySettings
 from posegraph_slam.mapping.texture import TextureSettings
 from posegraph_slam.odometry.scan_matching import ScanMatchingSettings
@@ -58,6 +59,7 @@ class Configuration(Settings):
     """Rebuild the maps from the trajectories."""
     mapping: OccupancySettings = OccupancySettings()
     texture: TextureSettings = TextureSettings()
+    floor: FloorSettings = FloorSettings()
     localization: LocalizationSettings = LocalizationSettings()
     particle_slam: ParticleSlamSettings = ParticleSlamSettings()
 

@@ -20,10 +20,11 @@ from posegraph_slam.loop_closure.ledger import LoopRecord
 from posegraph_slam.loop_closure.refinement import refine_overlaps
 from posegraph_slam.mapping.crispness import crispness
 from posegraph_slam.mapping.occupancy import OccupancyGrid, OccupancySettings, build_occupancy
-from posegraph_slam.mapping.texture import TextureMap, build_texture
+from posegraph_slam.mapping.texture import TextureMap
 from posegraph_slam.odometry.scan_matching import ScanMatchingResult
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.depth_maps import DepthMaps, build_depth_maps
 from posegraph_slam.pipeline.matching import keyframe_scans, match_log, motion_in_sweep
 from posegraph_slam.pipeline.plan_view import PlanView
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
@@ -48,7 +49,7 @@ class OptimizationResult:
     graph: PoseGraph
     loops: tuple[LoopRecord, ...]
     occupancy: OccupancyGrid | None
-    texture: TextureMap | None
+    depth_maps: DepthMaps
     comparison: ComparisonTable
     metrics: Mapping[str, Any]
     stages_s: Mapping[str, float]
@@ -59,6 +60,11 @@ class OptimizationResult:
     def trajectory(self) -> Trajectory:
         """The optimised trajectory, map -> base, a pose for every scan."""
         return self.stages["optimised"]
+
+    @property
+    def texture(self) -> TextureMap | None:
+        """The texture map, None where the log has no images."""
+        return self.depth_maps.texture
 
     @property
     def keyframes(self) -> IntArray:
@@ -104,7 +110,9 @@ def optimize(
     stages = dict(zip(STAGES, found, strict=True))
     with clock.stage("maps"):
         occupancy, crisp = _maps(view, stages, matched, executor, progress)
-        texture = _texture(log, stages["optimised"], occupancy, configuration, executor, progress)
+        depth_maps = build_depth_maps(
+            log, stages["optimised"], occupancy, configuration, executor=executor, progress=progress
+        )
     with clock.stage("evaluation"):
         measured = {
             name: evaluate_trajectory(
@@ -121,7 +129,7 @@ def optimize(
         graph=graph,
         loops=closed.records,
         occupancy=occupancy,
-        texture=texture,
+        depth_maps=depth_maps,
         comparison=compare(measured),
         metrics={
             "stages": {name: metrics.as_dict() for name, metrics in measured.items()},
@@ -131,7 +139,14 @@ def optimize(
         },
         stages_s=clock.seconds,
         truth=log.truth,
-        remarks=(*log.remarks, *odometry.remarks, *view.remarks, *matched.remarks, *_warnings(closed)),
+        remarks=(
+            *log.remarks,
+            *odometry.remarks,
+            *view.remarks,
+            *matched.remarks,
+            *_warnings(closed),
+            *depth_maps.remarks,
+        ),
     )
 
 
@@ -254,27 +269,6 @@ def keyframe_chain(matched: ScanMatchingResult) -> PoseGraph:
 def in_map_frame(trajectory: Trajectory) -> Trajectory:
     """Name the parent frame of an optimised trajectory."""
     return trajectory.with_poses(trajectory.poses, parent="map")
-
-
-def _texture(
-    log: RobotLog,
-    trajectory: Trajectory,
-    occupancy: OccupancyGrid | None,
-    configuration: Configuration,
-    executor: Executor,
-    progress: Progress,
-) -> TextureMap | None:
-    """Colour the floor, on the cells of the occupancy map, where the log has images."""
-    if occupancy is None or log.rgbd is None or not log.rgbd.has_images:
-        return None
-    return build_texture(
-        log.rgbd,
-        trajectory,
-        configuration.texture,
-        geometry=occupancy.geometry,
-        executor=executor,
-        progress=progress,
-    )
 
 
 def _summary(scans: LaserScans, matched: ScanMatchingResult, closed: LoopClosureResult) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from posegraph_slam.odometry import chosen_source
 from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.depth_maps import floor_step
 from posegraph_slam.sensors import RobotLog
 
 SOURCES = {
@@ -31,6 +32,7 @@ def describe(log: RobotLog, configuration: Configuration) -> list[str]:
     if log.rgbd is not None and log.rgbd.has_images:
         frames = sum(file is not None for file in log.rgbd.disparity_files)
         steps.append(f"colour the floor map from {frames} disparity images")
+        steps += [step] if (step := floor_step(configuration.floor)) else []
     elif log.rgbd is not None:
         steps.append("leave out the texture map: the camera's images are not in the log")
     known = [

@@ -50,17 +50,22 @@ def save_loops(result: OptimizationResult, directory: RunDirectory) -> None:
 
 
 def save_maps(result: OptimizationResult, directory: RunDirectory) -> None:
-    """Write the occupancy map, and the texture map where there is one."""
-    if result.occupancy is None:
-        return
-    save_occupancy(result.occupancy, directory)
-    if result.texture is not None:
-        write_png(texture_pixels(result.texture), directory.path("maps/texture.png"))
+    """Write the occupancy map, and the texture and floor maps where there are any.
+
+    `map` is the laser's occupancy map, `floor` what the depth camera says of the floor, `map_with_floor` the two
+    together, each for nav2, for eyes and exactly; all have the same cells.
+    """
+    maps = result.depth_maps
+    for name, grid in (("map", result.occupancy), ("floor", maps.alone), ("map_with_floor", maps.fused)):
+        if grid is not None:
+            save_occupancy(grid, directory, name)
+    if maps.texture is not None:
+        write_png(texture_pixels(maps.texture), directory.path("maps/texture.png"))
 
 
-def save_occupancy(occupancy: OccupancyGrid, directory: RunDirectory) -> None:
-    """Write an occupancy map for nav2, for eyes and exactly."""
-    folder = directory.path("maps/map.pgm").parent
-    write_nav2(occupancy, folder)
-    write_png(map_pixels(occupancy), folder / "map.png")
-    write_occupancy(occupancy, folder / "map.npz")
+def save_occupancy(occupancy: OccupancyGrid, directory: RunDirectory, name: str = "map") -> None:
+    """Write a map of occupancy for nav2, for eyes and exactly, as maps/NAME.*."""
+    folder = directory.path(f"maps/{name}.pgm").parent
+    write_nav2(occupancy, folder, name)
+    write_png(map_pixels(occupancy), folder / f"{name}.png")
+    write_occupancy(occupancy, folder / f"{name}.npz")

@@ -48,6 +48,8 @@ KIND_COLOURS = {
 }
 
 UNKNOWN_GREY = 0.85
+WALL_GREY = (60, 60, 60)
+FLOOR_GREEN, OBSTACLE_RED = (176, 214, 178), (213, 94, 0)
 PIXELS: dict[str, Any] = {"interpolation": "nearest"}
 
 
@@ -174,7 +176,7 @@ def draw_texture(
     walls = np.zeros_like(covered) if occupied is None else occupied
     picture = np.full((*covered.shape, 3), int(UNKNOWN_GREY * 255), dtype=np.uint8)
     picture[covered] = colours[covered]
-    picture[walls] = 60
+    picture[walls] = WALL_GREY
     view = View.of(geometry, covered | walls)
     with page(path, view.extent_m, title=title) as axes:
         axes.imshow(view.samples(picture), origin="lower", extent=view.extent_m, **PIXELS)
@@ -182,3 +184,35 @@ def draw_texture(
             draw_path(axes, trajectory)
         if occupied is not None:
             axes.plot([], [], color="0.24", linewidth=4, label="walls")
+
+
+def draw_floor(
+    floor: OccupancyGrid,
+    path: Path,
+    *,
+    trajectory: Trajectory | None = None,
+    occupied: BoolArray | None = None,
+    title: str = "",
+) -> None:
+    """Draw what a depth camera says of the floor into a PNG: floor green, obstacles red, undecided cells white.
+
+    `occupied` (rows, columns) draws the walls of the laser's map under the obstacles in dark grey.
+    """
+    layers: list[tuple[str, BoolArray, tuple[int, int, int]]] = [
+        ("floor", floor.free, FLOOR_GREEN),
+        ("undecided", floor.observed & ~floor.free & ~floor.occupied, (255, 255, 255)),
+        *([("walls seen by the laser", occupied, WALL_GREY)] if occupied is not None else []),
+        ("obstacle", floor.occupied, OBSTACLE_RED),
+    ]
+    picture = np.full((*floor.observed.shape, 3), int(UNKNOWN_GREY * 255), dtype=np.uint8)
+    for _, cells, colour in layers:
+        picture[cells] = colour
+    view = View.of(floor.geometry, floor.observed if occupied is None else floor.observed | occupied)
+    with page(path, view.extent_m, title=title) as axes:
+        axes.imshow(view.samples(picture), origin="lower", extent=view.extent_m, **PIXELS)
+        if trajectory is not None:
+            draw_path(axes, trajectory)
+        for name, cells, colour in layers:
+            if cells.any():
+                square = axes.plot([], [], "s", color=[c / 255 for c in colour], label=name)[0]
+                square.set_markeredgecolor("0.5")

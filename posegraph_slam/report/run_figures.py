@@ -7,13 +7,14 @@ import numpy as np
 from posegraph_slam.pipeline.optimize import OptimizationResult
 from posegraph_slam.pipeline.run_directory import RunDirectory
 from posegraph_slam.pose_graph.graph import ConstraintKind
-from posegraph_slam.report.figures import draw_map, draw_texture, draw_trajectories, loop_segments
+from posegraph_slam.report.figures import draw_floor, draw_map, draw_texture, draw_trajectories, loop_segments
 
 
 def draw_figures(result: OptimizationResult, directory: RunDirectory) -> None:
     """Draw the trajectories of the stages, the map with its loops, the rejected ones too, and the texture if any.
 
-    Files: figures/trajectories.png, figures/map.png, figures/map_rejected.png, figures/texture.png.
+    Files: figures/trajectories.png, figures/map.png, figures/map_rejected.png, figures/texture.png,
+    figures/floor.png.
     """
     draw_trajectories(result.stages, directory.path("figures/trajectories.png"), truth=result.truth)
     if result.occupancy is None:
@@ -31,13 +32,16 @@ def draw_figures(result: OptimizationResult, directory: RunDirectory) -> None:
             loops=loops,
             rejected=np.asarray(positions[result.rejected_pairs][..., :2]),
         )
-    if result.texture is not None:
-        shared = result.texture.geometry is result.occupancy.geometry
+    maps = result.depth_maps
+    walls = result.occupancy.occupied
+    if maps.texture is not None:
         draw_texture(
-            result.texture.geometry,
-            result.texture.colour,
-            result.texture.observed,
+            maps.texture.geometry,
+            maps.texture.colour,
+            maps.texture.observed,
             directory.path("figures/texture.png"),
             trajectory=result.trajectory,
-            occupied=result.occupancy.occupied if shared else None,
+            occupied=walls if maps.texture.geometry is result.occupancy.geometry else None,
         )
+    if maps.alone is not None:
+        draw_floor(maps.alone, directory.path("figures/floor.png"), trajectory=result.trajectory, occupied=walls)
