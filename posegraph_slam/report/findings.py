@@ -66,15 +66,18 @@ def key_figures(content: RunContent) -> list[Figure]:
                 note=f"of {count(metrics['loops_proposed'])} candidates",
             )
         )
-    last = list(content.trajectories.values())[-1] if content.trajectories else None
+    name, last = list(content.trajectories.items())[-1] if content.trajectories else ("", None)
     duration = 0.0
     if last is not None and len(last):
         duration = float(np.ptp(last.stamps_s))
+        # files are in the order of their stamps; the path was measured in that of the scans, which may differ
+        stage = metrics.get("stages", {}).get(name, {})
+        length_m = stage.get("path", {}).get("length_m", last.path_length_m)
         nodes = f", {count(metrics['keyframes'])} keyframes" if "keyframes" in metrics else ""
         figures.append(
             Figure(
                 label="Path",
-                value=f"{last.path_length_m:,.1f} m".replace(",", " "),
+                value=f"{length_m:,.1f} m".replace(",", " "),
                 note=f"{count(len(last))} scans{nodes}",
             )
         )
