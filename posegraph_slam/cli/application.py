@@ -17,6 +17,7 @@ from posegraph_slam.cli import (
     configuration,
     conversion,
     datasets,
+    editing,
     evaluating,
     inspection,
     localization,
@@ -93,6 +94,7 @@ def options(
 app.command("optimize", short_help="Optimise a log: trajectory, maps, comparison.")(optimisation.optimize)
 app.command("icp", short_help="Align clouds with the model of an object.")(alignment.icp)
 app.command("solve", short_help="Solve a pose graph and certify the optimum.")(solving.solve)
+app.command("edit", short_help="Edit the closures of a run in the browser.")(editing.edit)
 app.command("report", short_help="Show a run in one HTML file.")(reporting.report)
 app.command("inspect", short_help="Show what is in a log, and what is suspicious.")(inspection.inspect)
 app.command("localize", short_help="Find the robot in a known map at every scan.")(localization.localize)

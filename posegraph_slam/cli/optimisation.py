@@ -47,6 +47,9 @@ def optimize(
         str | None,
         typer.Option("--from", metavar="STAGE", help="LOG is a run directory: start over from `matching` or `graph`."),
     ] = None,
+    edits: Annotated[
+        Path | None, typer.Option("--edits", metavar="FILE", help="With --from graph: closures edited by hand.")
+    ] = None,
     page: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html at the end.")] = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -60,18 +63,28 @@ def optimize(
     from posegraph_slam.report.run_figures import draw_figures
 
     plan = plan_run(
-        log, config or [], settings or [], seed=seed, workers=workers, no_loops=no_loops, stages=stages, start=start
+        log,
+        config or [],
+        settings or [],
+        seed=seed,
+        workers=workers,
+        no_loops=no_loops,
+        stages=stages,
+        start=start,
+        edits=edits,
     )
+    again = start if edits is None else "edited"
     with ProgressBars(enabled=not quiet) as progress:
         summary = run(
             plan.log,
             plan.configuration,
-            out=out or default_out(plan.log if start is None else log.with_name(f"{log.resolve().name}-{start}")),
+            out=out or default_out(plan.log if start is None else log.with_name(f"{log.resolve().name}-{again}")),
             overwrite=overwrite,
             log_format=log_format or plan.log_format,
             topics={**(plan.topics or {}), **topic_names(topic)},
             truth=truth,
             matching_of=plan.matching_of,
+            edits=plan.edits,
             draw=draw_figures,
             report=write_report_of if page else None,
             progress=progress,

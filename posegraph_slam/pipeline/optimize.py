@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -78,35 +78,42 @@ class OptimizationResult:
         return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatchedLog:
+    """A log up to scan matching: what the planar stages see of it, the matched scans (N), the keyframes' scans (K)."""
+
+    view: PlanView
+    matched: ScanMatchingResult
+    beams: BeamScans
+
+
+Close = Callable[[], LoopClosureResult]
+"""Gives the closures of a run whose scan matching is taken over, in place of the search for them."""
+
+
 def optimize(
     log: RobotLog,
     configuration: Configuration,
     *,
     matched: ScanMatchingResult | None = None,
+    close: Close | None = None,
     progress: Progress = silent_progress,
     executor: Executor | None = None,
 ) -> OptimizationResult:
     """Run all stages on a log in memory: odometry, scan matching, loop closure, maps and their comparison.
 
-    `matched` is the scan matching of an earlier run of the same log, taken instead of a new one. The result depends
-    on the log and the configuration alone, not on the number of workers. Raises InputError for a log without usable
-    scans.
+    `matched` is the scan matching of an earlier run of the same log, taken instead of a new one, and `close`
+    gives its closures. The result depends on these, the log and the configuration alone, not on the number of workers.
+    Raises InputError for a log without usable scans.
     """
     executor, clock = executor or SerialExecutor(), StageClock()
-    scans = usable_scans(log)
-    with clock.stage("odometry"):
-        view = PlanView.of(log, scans, configuration)
-        odometry = view.odometry
-    with clock.stage("scan matching"):
-        if matched is None:
-            matched = match_log(view.scans, odometry, view.configuration, executor=executor, progress=progress)
-        beams = keyframe_scans(view.scans, matched, view.configuration, executor)
+    basis = match(log, configuration, matched=matched, progress=progress, executor=executor, clock=clock)
+    view, odometry, matched = basis.view, basis.view.odometry, basis.matched
     with clock.stage("loop closure"):
-        closed = _close(matched, beams, view, executor, progress)
+        closed = close() if close is not None else _close(matched, basis.beams, view, executor, progress)
     with clock.stage("refinement"):
-        graph = _refine(closed.graph, matched, beams, view, executor, progress)
-        graph, optimised = view.finish(graph, matched, progress)
-    found = (view.lifted(odometry.trajectory), view.lifted(matched.trajectory), in_map_frame(optimised))
+        graph, optimised = finish(closed.graph, basis, progress=progress, executor=executor)
+    found = (view.lifted(odometry.trajectory), view.lifted(matched.trajectory), optimised)
     stages = dict(zip(STAGES, found, strict=True))
     with clock.stage("maps"):
         occupancy, crisp = _maps(view, stages, matched, executor, progress)
@@ -133,8 +140,8 @@ def optimize(
         comparison=compare(measured),
         metrics={
             "stages": {name: metrics.as_dict() for name, metrics in measured.items()},
-            **_summary(scans, matched, closed),
-            "remarks": [*log.remarks, *odometry.remarks, *matched.remarks],
+            **_summary(view.scans, matched, closed),
+            "remarks": [*log.remarks, *odometry.remarks, *view.remarks, *matched.remarks],
             "warnings": list(_warnings(closed)),
         },
         stages_s=clock.seconds,
@@ -148,6 +155,35 @@ def optimize(
             *depth_maps.remarks,
         ),
     )
+
+
+def match(
+    log: RobotLog,
+    configuration: Configuration,
+    *,
+    executor: Executor,
+    matched: ScanMatchingResult | None = None,
+    progress: Progress = silent_progress,
+    clock: StageClock | None = None,
+) -> MatchedLog:
+    """Take a log up to scan matching; `matched` is that of an earlier run. Raises InputError for unusable scans."""
+    clock, scans = clock or StageClock(), usable_scans(log)
+    with clock.stage("odometry"):
+        view = PlanView.of(log, scans, configuration)
+    with clock.stage("scan matching"):
+        if matched is None:
+            matched = match_log(view.scans, view.odometry, view.configuration, executor=executor, progress=progress)
+        beams = keyframe_scans(view.scans, matched, view.configuration, executor)
+    return MatchedLog(view=view, matched=matched, beams=beams)
+
+
+def finish(
+    graph: PoseGraph, basis: MatchedLog, *, executor: Executor, progress: Progress = silent_progress
+) -> tuple[PoseGraph, Trajectory]:
+    """Refine a graph of keyframes with its closures; return it and the optimised trajectory of all scans (N)."""
+    graph = _refine(graph, basis.matched, basis.beams, basis.view, executor, progress)
+    graph, optimised = basis.view.finish(graph, basis.matched, progress)
+    return graph, in_map_frame(optimised)
 
 
 def _close(

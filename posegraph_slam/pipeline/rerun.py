@@ -8,6 +8,7 @@ from pathlib import Path
 
 from posegraph_slam.errors import ConfigurationError, InputError, did_you_mean
 from posegraph_slam.pipeline.configuration import Configuration, load_configuration
+from posegraph_slam.pipeline.edits import Edits, read_edits
 from posegraph_slam.pipeline.run_directory import CONFIGURATION, read_run_directory
 
 STAGE_SWITCHES = {
@@ -30,6 +31,8 @@ class RunPlan:
     log_format: str | None = None
     topics: Mapping[str, str] | None = None
     matching_of: Path | None = None
+    edits: Edits | None = None
+    """Changes to the closures of that run, which are then taken over too."""
 
 
 def plan_run(
@@ -42,13 +45,17 @@ def plan_run(
     no_loops: bool = False,
     stages: str | None = None,
     start: str | None = None,
+    edits: Path | None = None,
 ) -> RunPlan:
     """Turn the options of a run into a plan.
 
     With `start`, `log` is a run directory: its log and configuration are taken, the latter under `files` and
-    `overrides`. `stages` names the ones to run, comma-separated. Raises ConfigurationError for an unknown stage and
-    InputError for a run directory or log that is not there.
+    `overrides`. `stages` names the ones to run, comma-separated; `edits` is a file of changes to the closures of
+    a run that is taken up at its graph. Raises ConfigurationError for an unknown stage and InputError for a run
+    directory, log or file of edits that is not there.
     """
+    if edits is not None and (start != "graph" or no_loops or stages is not None):
+        raise ConfigurationError("--edits", "changes the closures of a finished run", "use it with --from graph alone")
     overrides = [*overrides, *(["loop_closure.enabled=false"] if no_loops else []), *_switches(stages)]
     if start is None:
         return RunPlan(log=log, configuration=load_configuration(files, overrides, seed=seed, workers=workers))
@@ -68,6 +75,7 @@ def plan_run(
         log_format=run.record["input"]["format"],
         topics=run.record["input"].get("topics"),
         matching_of=log if start == "graph" else None,
+        edits=read_edits(edits) if edits is not None else None,
     )
 
 

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from posegraph_slam.datasets.trajectory_files import read_trajectory
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pipeline.configuration import Configuration, usable_workers
+from posegraph_slam.pipeline.editing import check_log, close_with_edits, planar
+from posegraph_slam.pipeline.edits import Edits, edits_digest, to_text
 from posegraph_slam.pipeline.executors import open_executor
 from posegraph_slam.pipeline.matching_file import MATCHING, read_matching
 from posegraph_slam.pipeline.optimize import OptimizationResult, optimize
 from posegraph_slam.pipeline.recording import Report, RunSummary, recorded_run
-from posegraph_slam.pipeline.run_directory import RunDirectory, read_run_directory
+from posegraph_slam.pipeline.run_directory import APPLIED_EDITS, RunDirectory, read_run_directory
 from posegraph_slam.pipeline.saving import save_run
+from posegraph_slam.pipeline.stored_graph import read_stored_graph
 
 __all__ = ["Draw", "RunSummary", "run"]
 
@@ -32,6 +36,7 @@ def run(
     topics: Mapping[str, str] | None = None,
     truth: Path | None = None,
     matching_of: Path | None = None,
+    edits: Edits | None = None,
     draw: Draw | None = None,
     report: Report | None = None,
     progress: Progress = silent_progress,
@@ -40,9 +45,11 @@ def run(
     """Optimise the log at `log_path` and leave everything in the run directory `out`.
 
     `truth` names a file of true body poses (TUM, KITTI, EuRoC, CSV) that replaces the log's own; `matching_of` a run
-    directory of the same log whose scan matching is taken over; `topics` those of a bag. `out` appears when all is
-    written; an error leaves nothing. Raises InputError where `out` is taken or the log cannot be used.
+    directory of the same log whose scan matching is taken over, and with `edits` its closures too, as a person changed
+    them; `topics` those of a bag. `out` appears when all is written; an error leaves nothing. Raises InputError where
+    `out` is taken or the log cannot be used.
     """
+    close = None
     with recorded_run(
         log_path,
         configuration,
@@ -59,9 +66,16 @@ def run(
             if truth is not None:
                 log = dataclasses.replace(log, truth=read_trajectory(truth))
             if matching_of is not None and log.scans is not None:
-                matched = read_matching(read_run_directory(matching_of).path(MATCHING), len(log.scans))
+                earlier = read_run_directory(matching_of)
+                matched = read_matching(earlier.path(MATCHING), len(log.scans))
+                if edits is not None:
+                    check_log(edits, earlier)
+                    stored = planar(read_stored_graph(earlier))
+                    close = partial(close_with_edits, stored, edits, configuration.pose_graph)
+                    under_way.inputs["edits"] = {"run": str(matching_of.resolve()), "sha256": edits_digest(edits)}
+                    under_way.directory.write_text(APPLIED_EDITS, to_text(edits))
         with open_executor(usable_workers(configuration)) as executor:
-            result = optimize(log, configuration, matched=matched, progress=progress, executor=executor)
+            result = optimize(log, configuration, matched=matched, close=close, progress=progress, executor=executor)
         clock.seconds.update(result.stages_s)
         with clock.stage("saving"):
             save_run(result, under_way.directory)

@@ -25,6 +25,8 @@ from posegraph_slam.pipeline.configuration import Configuration, load_configurat
 from posegraph_slam.pipeline.settings_files import to_toml
 
 RECORD, CONFIGURATION, METRICS, LOOPS = "run.json", "config.toml", "metrics.json", "loops.csv"
+EDITS, APPLIED_EDITS = "edits.toml", "applied_edits.toml"
+"""A person's edits of this run, and those of another run that this one was made with."""
 FORMAT_VERSION = 1
 """Raised when files change so that older readers would misread them."""
 
@@ -96,13 +98,16 @@ def _cell(value: object) -> str:
 def require_free(path: Path, *, overwrite: bool) -> None:
     """Raise InputError unless a run may be written to `path`.
 
-    An existing run directory needs `overwrite`; a folder with anything else in it, or a file, is never replaced.
+    An existing run directory needs `overwrite`; a folder with anything else in it, a run that was edited by hand, or a
+    file is never replaced.
     """
     if path.is_dir():
         if any(path.iterdir()) and not (path / RECORD).is_file():
             raise InputError(path, "is a folder that is not a run directory", "choose another --out")
         if not overwrite and (path / RECORD).is_file():
             raise InputError(path, "already holds a run", "add --overwrite to replace it, or choose another --out")
+        if (path / EDITS).is_file():
+            raise InputError(path / EDITS, "was made by hand and would be lost", "move it away, then --overwrite")
     elif path.exists():
         raise InputError(path, "is a file", "choose another --out")
 

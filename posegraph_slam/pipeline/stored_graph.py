@@ -25,6 +25,7 @@ REMEDY = "run `psg optimize` again to write it"
 class StoredGraph:
     """A run's graph: first the chain of scan matching, then the accepted closures, then the matches of overlaps.
 
+    In space, what holds attitudes and heights follows.
     `records` are all candidates in the order in which they were tried; `record_of` (C,) says which one each of the C
     closures is. `graph.index` holds the scans that are nodes.
     """
@@ -64,9 +65,22 @@ def read_stored_graph(run: StoredRun) -> StoredGraph:
         raise InputError(path, f"does not belong to {LOOPS}: its edges are others", REMEDY)
     kind = np.full(len(c), int(ConstraintKind.OVERLAP))
     kind[:first] = int(ConstraintKind.SCAN_MATCHING)
+    at = attitudes(c, len(graph))
+    kind[at], kind[at.stop :] = int(ConstraintKind.ATTITUDE), int(ConstraintKind.SAME_GROUND)
     kind[first : first + len(ends)] = [int(ConstraintKind[records[row].kind.upper()]) for row in record_of]
     typed = Constraints(i=c.i, j=c.j, T_i_j=c.T_i_j, information=c.information, kind=kind)
     return StoredGraph(graph=graph.with_constraints(typed), records=records, record_of=record_of)
+
+
+def attitudes(c: Constraints, nodes: int) -> slice:
+    """Return where a graph in space ties every node to the first by its attitude; equal grounds follow it."""
+    others = np.arange(1, nodes)
+    starts = np.flatnonzero((c.i == 0) & (c.j == 1))[1:].tolist()  # the first is of the chain
+    for start in starts if c.T_i_j.shape[-1] == 4 else []:
+        rows = slice(start, start + nodes - 1)
+        if np.array_equal(c.j[rows], others) and not c.i[rows].any():
+            return rows
+    return slice(len(c), len(c))
 
 
 def read_loops(path: Path) -> tuple[LoopRecord, ...]:

@@ -32,6 +32,8 @@ class ConstraintKind(IntEnum):
     """Roll and pitch of a node, relative to a fixed one; all else is left free."""
     SAME_GROUND = 9
     """Two nodes stand at one place at the same height."""
+    MANUAL = 10
+    """Proposed by a person, and registered like any other."""
 
     @property
     def is_loop(self) -> bool:

@@ -37,16 +37,15 @@ def residuals_by_origin(stored: StoredGraph) -> dict[str, Residuals]:
     graph, kind = stored.graph, stored.graph.constraints.kind
     errors = constraint_residuals(graph)
     squared = chi2_of_residuals(errors, graph.constraints.information)
-    overlap = kind == int(ConstraintKind.OVERLAP)
-    origins = {
-        "scan matching": ~graph.constraints.is_loop,
-        "closures": graph.constraints.is_loop & ~overlap,
-        "overlaps": overlap,
-    }
+    matching, overlap = kind == int(ConstraintKind.SCAN_MATCHING), kind == int(ConstraintKind.OVERLAP)
+    closure = graph.constraints.is_loop & ~overlap & (kind != int(ConstraintKind.SAME_GROUND))
+    origins = {"scan matching": matching, "closures": closure, "overlaps": overlap}
+    # the tangent of SE(2) is [position, rotation], that of SE(3) [rotation, position]
+    position, rotation = (slice(0, 2), slice(2, 3)) if graph.group.dimension == 2 else (slice(3, 6), slice(0, 3))
     return {
         name: Residuals(
-            position_m=np.hypot(errors[rows, 0], errors[rows, 1]),
-            rotation_rad=np.abs(errors[rows, 2]),
+            position_m=np.linalg.norm(errors[rows, position], axis=1),
+            rotation_rad=np.linalg.norm(errors[rows, rotation], axis=1),
             chi2=squared[rows],
         )
         for name, rows in origins.items()

@@ -45,6 +45,7 @@ KIND_COLOURS = {
     ConstraintKind.GLOBAL: VERMILLION,
     ConstraintKind.OVERLAP: ORANGE,
     ConstraintKind.EXTERNAL: BLACK,
+    ConstraintKind.MANUAL: VERMILLION,
 }
 
 UNKNOWN_GREY = 0.85

@@ -159,7 +159,7 @@ def _closures(content: RunContent) -> Iterator[str]:
     if stored is None:
         return
     first, number = len(stored.graph) - 1, len(stored.record_of)
-    steps = np.linalg.norm(np.diff(stored.graph.poses[:, :2, 2], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(stored.graph.poses[:, :2, -1], axis=0), axis=1)
     if number == 0 and float(steps.sum()) > LONG_PATH_M:
         yield f"no loop was closed on a path of {steps.sum():.0f} m: its drift stays in the map"
         return

@@ -103,7 +103,7 @@ def graph_layers(stored: StoredGraph) -> dict[str, Any]:
     rejected = [row for row, record in enumerate(stored.records) if not record.accepted]
     shown = sorted([*accepted, *rejected[-REJECTED_SHOWN:]])
     return {
-        "nodes": {"mm": millimetres(graph.poses[:, :2, 2]), "scan": np.diff(graph.index, prepend=0).tolist()},
+        "nodes": {"mm": millimetres(graph.poses[:, :2, -1]), "scan": np.diff(graph.index, prepend=0).tolist()},
         "loops": loop_rows([stored.records[row] for row in shown], [accepted.get(row) for row in shown], graph),
         "loops_left_out": len(stored.records) - len(shown),
         "overlaps": overlap_rows(graph, squared),
