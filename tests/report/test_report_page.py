@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from posegraph_slam.errors import InputError
 from posegraph_slam.pipeline.run_directory import read_run_directory
-from posegraph_slam.pipeline.stored_graph import read_stored_graph
-from posegraph_slam.pose_graph.graph import ConstraintKind
+from posegraph_slam.pipeline.stored_graph import attitudes, read_stored_graph
+from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
 from posegraph_slam.report.charts import BINS, decade_axis, histogram, linear_axis
 from posegraph_slam.report.findings import clock, warnings
 from posegraph_slam.report.map_layers import PATH_POINTS, map_layers, millimetres, thinned
@@ -286,3 +286,18 @@ def test_durations_and_reasons_read_well() -> None:
     ]  # fmt: skip
     assert general_reason("too few points match: 0.40") == "too few points match"
     assert general_reason("would move the graph by 4.1 sigma") == "would move the graph by … sigma"
+
+
+def test_attitudes_of_a_graph_in_space_are_told_from_its_overlaps() -> None:
+    nodes = 5
+    pairs = [(0, 1), (1, 2), (2, 3), (3, 4), (0, 3), (0, 1), (1, 2), *((0, k) for k in range(1, nodes)), (0, 4)]
+    i, j = np.array(pairs).T
+    shared = {"i": i, "j": j, "kind": np.zeros(len(i), dtype=np.int64)}
+    spatial = Constraints(
+        T_i_j=np.tile(np.eye(4), (len(i), 1, 1)), information=np.tile(np.eye(6), (len(i), 1, 1)), **shared
+    )
+    assert attitudes(spatial, nodes) == slice(7, 11)
+    plane = Constraints(
+        T_i_j=np.tile(np.eye(3), (len(i), 1, 1)), information=np.tile(np.eye(3), (len(i), 1, 1)), **shared
+    )
+    assert attitudes(plane, nodes) == slice(12, 12)
