@@ -23,6 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from readme_table import write_table
+
 from references import REFERENCES, Reference
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -250,6 +252,7 @@ def main() -> None:
         replace_text(arguments.out or RESULTS, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
     if official:
         write_between_markers(PAGE, BEGIN, END, text)
+        write_table(rows)
 
 
 def machine() -> dict[str, Any]:
