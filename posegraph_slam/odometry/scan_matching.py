@@ -12,11 +12,13 @@ from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
 from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt, xyt_from_pose
 from posegraph_slam.odometry.estimate import OdometryEstimate, covariance_between
+from posegraph_slam.odometry.hit_map_tracking import track_on_hits
 from posegraph_slam.odometry.local_map import STATISTICS, track
 from posegraph_slam.odometry.scan_to_scan import chain_by_icp
 from posegraph_slam.registration.beam_information import information_in_base, information_with_floor, inverse
 from posegraph_slam.registration.beam_matching import BeamMatchSettings
 from posegraph_slam.registration.beam_scans import BeamScans
+from posegraph_slam.registration.hit_map_matching import HitMapSettings
 from posegraph_slam.registration.local_search import LocalSearchSettings
 from posegraph_slam.registration.settings import IcpSettings
 from posegraph_slam.settings import Settings
@@ -25,8 +27,9 @@ from posegraph_slam.settings import Settings
 class ScanMatchingSettings(Settings):
     """How scans are chained into a trajectory."""
 
-    matcher: Literal["local_map", "scan_to_scan", "none"] = "local_map"
-    """`local_map`: to lines of the last keyframes; `scan_to_scan`: ICP to the scan before; `none`: odometry alone."""
+    matcher: Literal["local_map", "scan_to_scan", "correlative", "none"] = "local_map"
+    """`local_map`: to lines of the last keyframes; `scan_to_scan`: ICP to the scan before; `correlative`: to one
+    growing map of hit counts; `none`: odometry alone."""
     references: int = Field(default=4, ge=1, le=64)
     """Keyframes that form the local map: the last two,"""
     reference_stride: int = Field(default=3, ge=1, le=64)
@@ -58,6 +61,10 @@ class ScanMatchingSettings(Settings):
     icp: IcpSettings = IcpSettings()
     """Registration of a scan to the one before it (`scan_to_scan`)."""
     search: LocalSearchSettings = LocalSearchSettings()
+    hits: HitMapSettings = HitMapSettings()
+    """Map and windows of `correlative`."""
+    hits_size_m: float = Field(default=0.0, ge=0)
+    """Side of that map, a square about the start; 0: it fits the log."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,6 +107,8 @@ def match_scans(
     progress("scan matching", 0, len(scans))
     if settings.matcher == "local_map":
         result = _track_local_map(scans, odometry, settings)
+    elif settings.matcher == "correlative":
+        result = _match_on_hits(scans, odometry, settings)
     elif settings.matcher == "scan_to_scan":
         result = _chain_scans(scans, odometry, settings, executor or SerialExecutor(), progress)
     else:
@@ -203,6 +212,24 @@ def _chain_scans(
         matched_fraction=np.concatenate([[1.0], pairs.inlier_fraction]),
         searched=np.zeros(0, dtype=np.int64),
         remarks=(remark,) if len(failed) else (),
+    )
+
+
+def _match_on_hits(scans: BeamScans, odometry: OdometryEstimate, settings: ScanMatchingSettings) -> ScanMatchingResult:
+    """Match to the map of hit counts: what a pose is known to is the step of the fine window, and a floor."""
+    poses, share = track_on_hits(scans, odometry, settings.hits, settings.hits_size_m)
+    fine, keyframes = settings.hits.fine, select_keyframes(poses, settings)
+    sigma_m = np.hypot(fine.step_m, settings.covariance_floor_m)
+    sigma_rad = np.hypot(fine.step_rad, settings.covariance_floor_rad)
+    matched = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
+    covariance = covariance_between(poses, odometry.covariance, keyframes[:-1], keyframes[1:])
+    return ScanMatchingResult(
+        trajectory=odometry.trajectory.with_poses(poses),
+        keyframes=keyframes,
+        keyframe_information=matched + inverse(covariance),
+        scan_information=np.tile(matched, (len(poses), 1, 1)),
+        matched_fraction=share,
+        searched=np.zeros(0, dtype=np.int64),
     )
 
 
