@@ -1,6 +1,6 @@
-"""Parts of the inverse of a factored block matrix: its diagonal blocks, and whole block columns.
+"""Parts of the inverse of a factored block matrix: the blocks within its pattern, and whole block columns.
 
-The diagonal comes from Takahashi's recursion on supernodes: with J the pivots of a supernode and R the rest of its
+The first come from Takahashi's recursion on supernodes: with J the pivots of a supernode and R the rest of its
 front, Z_RJ = -Z_RR U_JR^T U_JJ^-T and Z_JJ = U_JJ^-1 U_JJ^-T - U_JJ^-1 U_JR Z_RJ, from the last supernode to the
 first; Z_RR lies in the front of the parent (Erisman and Tinney 1975).
 """
@@ -15,17 +15,20 @@ from posegraph_slam.pose_graph.block_pattern import BlockPattern
 from posegraph_slam.pose_graph.block_substitution import solve_many
 
 
-def inverse_diagonal(pattern: BlockPattern, factor: FloatArray) -> FloatArray:
-    """Return the diagonal blocks (n, p, p) of the inverse of a matrix factored by `factorize`, zero where left out."""
-    tree = pattern.elimination
-    sizes = pattern.block * (np.diff(tree.start) + np.diff(tree.row_start))
-    blocks = np.empty((len(pattern.rows), pattern.block, pattern.block))
+def inverse_blocks(pattern: BlockPattern, factor: FloatArray, edges: int) -> tuple[FloatArray, FloatArray]:
+    """Return the blocks of the inverse of a matrix factored by `factorize` where the matrix has its own.
+
+    These are the diagonal ones (n, p, p) and those at (i, j) (`edges`, p, p), as many as the pattern was made of; zero
+    where a row is left out.
+    """
+    tree, p = pattern.elimination, pattern.block
+    sizes = p * (np.diff(tree.start) + np.diff(tree.row_start))
+    diagonal, off = np.zeros((pattern.count, p, p)), np.zeros((edges, p, p))
     stack = np.empty(_path_size(sizes, tree.parent))
-    _inverse_diagonal(pattern.block, tree.start, tree.row_start, tree.relative, tree.parent, pattern.factor_start,
-                      factor, pattern.largest_front, stack, blocks)  # fmt: skip
-    result = np.zeros((pattern.count, *blocks.shape[1:]))
-    result[pattern.rows] = blocks[tree.position]
-    return result
+    _inverse_blocks(p, tree.start, tree.row_start, tree.relative, tree.parent, pattern.factor_start, factor,
+                    pattern.entry_start, pattern.entry, pattern.entry_row, pattern.entry_column,
+                    pattern.largest_front, stack, diagonal, off)  # fmt: skip
+    return diagonal, off
 
 
 def inverse_columns(pattern: BlockPattern, factor: FloatArray, rows: IntArray) -> FloatArray:
@@ -48,9 +51,10 @@ def _path_size(sizes: IntArray, parent: IntArray) -> int:
 
 
 @kernel
-def _inverse_diagonal(p: int, start: IntArray, row_start: IntArray, relative: IntArray, parent: IntArray,
-                      factor_start: IntArray, factor: FloatArray, largest: int, stack: FloatArray,
-                      blocks: FloatArray) -> None:  # fmt: skip
+def _inverse_blocks(p: int, start: IntArray, row_start: IntArray, relative: IntArray, parent: IntArray,
+                    factor_start: IntArray, factor: FloatArray, entry_start: IntArray, entry: IntArray,
+                    entry_row: IntArray, entry_column: IntArray, largest: int, stack: FloatArray,
+                    diagonal: FloatArray, off: FloatArray) -> None:  # fmt: skip
     supernodes = len(parent)
     offset = np.zeros(supernodes, np.int64)  # where the inverse of each front on the path begins
     column, where = np.empty(largest), np.empty(largest, np.int64)
@@ -89,7 +93,13 @@ def _inverse_diagonal(p: int, start: IntArray, row_start: IntArray, relative: In
                 total -= result[m] * column[k + 1 + m]
                 Z[k + 1 + m, k] = result[m]
             Z[k, k] = total
-        for b in range(start[node + 1] - start[node]):
+        for slot in range(entry_start[node], entry_start[node + 1]):
+            top, left, which = entry_row[slot] * p, entry_column[slot] * p, entry[slot]
             for r in range(p):
                 for c in range(p):
-                    blocks[start[node] + b, r, c] = Z[b * p + r, b * p + c]
+                    if which < 0:
+                        off[-1 - which - len(diagonal), c, r] = Z[top + r, left + c]
+                    elif which < len(diagonal):
+                        diagonal[which, r, c] = Z[top + r, left + c]
+                    else:
+                        off[which - len(diagonal), r, c] = Z[top + r, left + c]

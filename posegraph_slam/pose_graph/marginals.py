@@ -14,7 +14,7 @@ import numpy.typing as npt
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import GraphError
 from posegraph_slam.pose_graph.block_cholesky import factorize
-from posegraph_slam.pose_graph.block_inverse import inverse_columns, inverse_diagonal
+from posegraph_slam.pose_graph.block_inverse import inverse_blocks, inverse_columns
 from posegraph_slam.pose_graph.block_pattern import BlockPattern
 from posegraph_slam.pose_graph.checks import check_graph
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
@@ -37,10 +37,19 @@ class Marginals:
 
     def covariances(self) -> FloatArray:
         """Return the covariance (N, p, p) of every pose, in the frame of each pose."""
-        p = self.graph.group.dof
+        return self._blocks()[0]
+
+    def of_constraints(self) -> FloatArray:
+        """Return the covariances (E, p, p) of T_i_j between the nodes of every constraint: no more work than poses."""
+        c, (own, between) = self.graph.constraints, self._blocks()
+        return self._relative(c.i, c.j, own, between)
+
+    def _blocks(self) -> tuple[FloatArray, FloatArray]:
+        p, c = self.graph.group.dof, self.graph.constraints
         if self.pattern is None:
-            return np.zeros((len(self.graph), p, p))
-        return symmetrised(inverse_diagonal(self.pattern, self.factor))
+            return np.zeros((len(self.graph), p, p)), np.zeros((len(c), p, p))
+        own, between = inverse_blocks(self.pattern, self.factor, len(c))
+        return symmetrised(own), between
 
     def cross_covariances(self, i: IntArray, j: IntArray) -> FloatArray:
         """Return the covariances (K, p, p) between poses i (rows) and j (columns)."""
@@ -60,16 +69,17 @@ class Marginals:
         return result
 
     def relative(self, i: npt.ArrayLike, j: npt.ArrayLike) -> FloatArray:
-        """Return the covariances (K, p, p) of T_i_j for pairs of rows i, j (K,), in the frame of each j.
-
-        With d_i, d_j the updates of both poses, that of T_i_j is d_j - Ad(T_j_i) d_i (Sola et al. 2018, section IV).
-        """
+        """Return the covariances (K, p, p) of T_i_j for pairs of rows i, j (K,), in the frame of each j."""
         first, second = _rows(self.graph, i), _rows(self.graph, j)
-        group, own = self.graph.group, self.covariances()
-        A = group.adjoint(group.between(self.graph.poses[second], self.graph.poses[first]))
-        mixed = A @ self.cross_covariances(first, second)
-        result = A @ own[first] @ np.swapaxes(A, 1, 2) + own[second] - mixed - np.swapaxes(mixed, 1, 2)
-        return symmetrised(np.where((first == second)[:, None, None], 0.0, result))
+        return self._relative(first, second, self.covariances(), self.cross_covariances(first, second))
+
+    def _relative(self, i: IntArray, j: IntArray, own: FloatArray, between: FloatArray) -> FloatArray:
+        """With d_i, d_j the updates of both poses, that of T_i_j is d_j - Ad(T_j_i) d_i (Sola et al. 2018, sec. IV)."""
+        group = self.graph.group
+        A = group.adjoint(group.between(self.graph.poses[j], self.graph.poses[i]))
+        mixed = A @ between
+        result = A @ own[i] @ np.swapaxes(A, 1, 2) + own[j] - mixed - np.swapaxes(mixed, 1, 2)
+        return symmetrised(np.where((i == j)[:, None, None], 0.0, result))
 
 
 def factored_marginals(graph: PoseGraph, *, weights: FloatArray | None = None) -> Marginals:

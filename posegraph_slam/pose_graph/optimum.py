@@ -18,8 +18,8 @@ from posegraph_slam.pose_graph.certificate import Certificate, CertificateStatus
 from posegraph_slam.pose_graph.checks import check_graph
 from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
 from posegraph_slam.pose_graph.graph_file import node_ids, write_text
+from posegraph_slam.pose_graph.linearization import chi2_at
 from posegraph_slam.pose_graph.outliers import Classified, OutlierMethod, OutlierSettings, classify_loops, loop_weights
-from posegraph_slam.pose_graph.residuals import chi2
 from posegraph_slam.pose_graph.solve import graph_cost, solve
 from posegraph_slam.pose_graph.solver_settings import SolveResult, SolverSettings
 from posegraph_slam.pose_graph.starts import Start, starting_poses
@@ -111,7 +111,8 @@ def find_optimum(
     solved = graph.with_poses(result.poses)
     return Optimum(
         graph=solved, start=start, error_initial=graph_cost(used, solver.robust), error=result.cost,
-        iterations=iterations, result=result, kept=kept, chi2=chi2(solved),
+        iterations=iterations, result=result, kept=kept,
+        chi2=chi2_at(result.poses, graph.constraints),
         weights=loop_weights(solved, settings.outliers, kept), classified=classified, certificate=certificate,
         seconds=seconds, notes=result.notes)  # fmt: skip
 

@@ -19,8 +19,8 @@ from posegraph_slam.arrays import BoolArray, FloatArray, read_only
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pose_graph.editing import with_information
 from posegraph_slam.pose_graph.graph import PoseGraph
+from posegraph_slam.pose_graph.linearization import chi2_at, residuals_at
 from posegraph_slam.pose_graph.marginals import factored_marginals
-from posegraph_slam.pose_graph.residuals import chi2, constraint_residuals
 from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings, constraint_costs, constraint_weights
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
 from posegraph_slam.pose_graph.sparse_solver import run_sparse
@@ -41,8 +41,8 @@ ROUNDS = 10
 SHORT = 5
 """Solver steps between classifications with a wide gate."""
 PURGES = 10
-PURGED_LOOPS = 5000
-"""Above so many loops none is left out singly: their covariances take 0.4 ms each."""
+FEW = 0.4
+"""Share of loops kept below which a candidate may have missed the right basin."""
 AGREEMENT = 1e-3
 """Two candidates whose scores differ by less, relative, are taken to have found the same."""
 GATE_MARGIN = 10.0
@@ -106,7 +106,7 @@ def gate_of(graph: PoseGraph, probability: float) -> float:
 
 def truncated_score(graph: PoseGraph, gate: float) -> float:
     """Return odometry chi-square plus sum min(chi-square, gate) over loops, at the graph's poses."""
-    squared = chi2(graph)
+    squared = chi2_at(graph.poses, graph.constraints)
     return float(np.sum(np.where(graph.constraints.is_loop, np.minimum(squared, gate), squared)))
 
 
@@ -117,7 +117,8 @@ def classify_loops(
     """Find the true loops of a graph whose odometry is right, by the candidates of the method (`GNC` or `AUTO`).
 
     The poses of the graph are the start: the odometry chain, unless something better is known. `AUTO` tries DCS and
-    Cauchy before DCS, and graduated non-convexity, which costs more, only where those two disagree.
+    Cauchy before DCS, and graduated non-convexity, which costs far more, only where those two disagree and the better
+    one keeps few loops.
     """
     solver = SolverSettings() if solver is None else solver
     gate = gate_of(graph, settings.gate_probability)
@@ -132,8 +133,7 @@ def classify_loops(
     found: dict[str, tuple[float, FloatArray]] = {}
     for number, name in enumerate(names):
         progress("outliers", number, len(names))
-        scores = [score for score, _ in found.values()]
-        if name == "gnc" and len(scores) > 1 and max(scores) <= min(scores) * (1 + AGREEMENT):
+        if name == "gnc" and len(found) > 1 and _trusted(graph, list(found.values()), gate):
             break
         found[name] = _widened(graph, search[name](), gate, solver)
     progress("outliers", len(names), len(names))
@@ -141,15 +141,24 @@ def classify_loops(
     settled = {name: _settled(graph, poses, gate, gate, solver) for name, (_, poses) in found.items()}
     winner = min(settled, key=lambda name: settled[name][0])
     poses = _purged(graph, settled[winner][1], gate, solver)
-    kept = ~graph.constraints.is_loop | (chi2(graph.with_poses(poses)) <= gate)
+    kept = ~graph.constraints.is_loop | (chi2_at(poses, graph.constraints) <= gate)
     return Classified(
         kept=kept, poses=poses, gate=gate, winner=winner, scores={name: settled[name][0] for name in settled}
     )
 
 
+def _trusted(graph: PoseGraph, found: list[tuple[float, FloatArray]], gate: float) -> bool:
+    """Tell whether candidates (score, poses) agree, or the best keeps so many loops that it is in the right basin."""
+    scores = [score for score, _ in found]
+    if max(scores) <= min(scores) * (1 + AGREEMENT):
+        return True
+    best = min(found, key=lambda pair: pair[0])[1]
+    return bool(np.mean(chi2_at(best, graph.constraints)[graph.constraints.is_loop] <= gate) >= FEW)
+
+
 def _fitting_gate(graph: PoseGraph, gate: float) -> float:
     """Narrow the gate where kept loops fit better than their information says, by the median of their chi-square."""
-    squared = chi2(graph)[graph.constraints.is_loop]
+    squared = chi2_at(graph.poses, graph.constraints)[graph.constraints.is_loop]
     inside = squared[squared <= gate]
     if len(inside) == 0:
         return gate
@@ -163,10 +172,8 @@ def _purged(graph: PoseGraph, poses: FloatArray, gate: float, solver: SolverSett
     dropped = np.zeros(len(is_loop), dtype=np.bool_)
     best = truncated_score(graph.with_poses(poses), gate)
     for _ in range(PURGES):
-        kept = ~dropped & (~is_loop | (chi2(graph.with_poses(poses)) <= gate))
+        kept = ~dropped & (~is_loop | (chi2_at(poses, graph.constraints) <= gate))
         inside = np.flatnonzero(kept & is_loop)
-        if len(inside) > PURGED_LOOPS:
-            return poses
         saved = _savings(graph.with_poses(poses).with_constraints(graph.constraints.select(kept)))
         worst = saved > max(gate, 0.5 * float(np.max(saved, initial=0.0)))
         if not worst.any():
@@ -187,8 +194,8 @@ def _savings(graph: PoseGraph) -> FloatArray:
     """
     edges = np.flatnonzero(graph.constraints.is_loop)
     loops = graph.constraints.select(edges)
-    residuals = constraint_residuals(graph.with_constraints(loops))
-    relative = factored_marginals(graph).relative(loops.i, loops.j)
+    residuals = residuals_at(graph.poses, loops)
+    relative = factored_marginals(graph).of_constraints()[edges]
     spread = np.linalg.inv(loops.information) - relative
     values, vectors = np.linalg.eigh(0.5 * (spread + np.swapaxes(spread, 1, 2)))
     along = np.einsum("eij,ei->ej", vectors, residuals)
@@ -223,7 +230,7 @@ def _passes(
     best = truncated_score(graph.with_poses(poses), gate), poses
     steps = solver.max_iterations if admit <= gate else SHORT
     for _ in range(ROUNDS):
-        now = ~is_loop | (chi2(graph.with_poses(poses)) <= admit)
+        now = ~is_loop | (chi2_at(poses, graph.constraints) <= admit)
         if kept is not None and np.array_equal(now, kept):
             break
         kept = now
@@ -237,7 +244,7 @@ def _reweighted(graph: PoseGraph, poses: FloatArray, solver: SolverSettings, los
     settings, is_loop = RobustSettings(loss=loss), graph.constraints.is_loop
     before = np.inf
     for _ in range(REWEIGHTINGS):
-        squared = chi2(graph.with_poses(poses))
+        squared = chi2_at(poses, graph.constraints)
         cost = float(np.sum(constraint_costs(is_loop, squared, settings)))
         if before - cost <= 1e-4 * cost:
             break
@@ -259,8 +266,8 @@ def _solved(graph: PoseGraph, poses: FloatArray, weights: FloatArray, solver: So
 def graduated(graph: PoseGraph, settings: OutlierSettings, solver: SolverSettings) -> FloatArray:
     """Solve with truncated least squares on loops by graduated non-convexity; return poses (N, d+1, d+1)."""
     is_loop, gate = graph.constraints.is_loop, gate_of(graph, settings.gate_probability)
-    poses = _solved(graph, graph.poses, np.ones(len(is_loop)), solver, solver.max_iterations)
-    squared = chi2(graph.with_poses(poses))
+    poses = _solved(graph, graph.poses, np.ones(len(is_loop)), solver, SHORT)
+    squared = chi2_at(poses, graph.constraints)
     largest = float(np.max(squared[is_loop], initial=0.0))
     if largest <= gate:
         return poses
@@ -268,7 +275,7 @@ def graduated(graph: PoseGraph, settings: OutlierSettings, solver: SolverSetting
     for _ in range(200):
         weights = np.where(is_loop, truncated_weights(squared, gate, control), 1.0)
         poses = _solved(graph, poses, weights, solver, settings.inner_iterations)
-        squared = chi2(graph.with_poses(poses))
+        squared = chi2_at(poses, graph.constraints)
         inside = weights[is_loop]
         if np.all((inside < LEAST_WEIGHT) | (inside > 1 - LEAST_WEIGHT)) or control > 1e6:
             break
@@ -288,5 +295,5 @@ def truncated_weights(chi2: FloatArray, gate: float, control: float) -> FloatArr
 def loop_weights(graph: PoseGraph, settings: OutlierSettings, kept: BoolArray | None) -> FloatArray:
     """Return the weight (E,) of every constraint at the graph's poses: of the loss, or 1 where kept and 0 elsewhere."""
     if settings.loss is not None:
-        return constraint_weights(graph.constraints.is_loop, chi2(graph), settings.loss)
+        return constraint_weights(graph.constraints.is_loop, chi2_at(graph.poses, graph.constraints), settings.loss)
     return np.ones(len(graph.constraints)) if kept is None else kept.astype(np.float64)

@@ -102,3 +102,10 @@ def test_many_pairs_are_solved_in_pieces(solved: PoseGraph) -> None:
         cross, np.swapaxes(marginals.cross_covariances(pairs[:, 1], pairs[:, 0]), 1, 2), atol=1e-10
     )
     np.testing.assert_allclose(whole[7], relative_covariance(solved, *pairs[7].tolist()))
+
+
+def test_covariances_of_constraints_are_those_of_their_pairs(graph: PoseGraph) -> None:
+    factored = factored_marginals(graph)
+    c = graph.constraints
+    expected = factored.relative(c.i, c.j)
+    np.testing.assert_allclose(factored.of_constraints(), expected, rtol=1e-7, atol=1e-12 * np.abs(expected).max())

@@ -68,7 +68,7 @@ def test_everything_is_reported_for_every_edge(spoilt) -> None:
     graph, false, _ = spoilt
     optimum = find_optimum(graph, OptimumSettings(outliers=OutlierSettings(method=OutlierMethod.AUTO)))
     assert len(optimum.kept) == len(optimum.weights) == len(optimum.chi2) == len(graph.constraints)
-    np.testing.assert_allclose(optimum.chi2, chi2(optimum.graph))
+    np.testing.assert_allclose(optimum.chi2, chi2(optimum.graph), rtol=1e-7, atol=1e-20)
     np.testing.assert_array_equal(optimum.weights > 0, optimum.kept)
     assert optimum.error == pytest.approx(0.5 * optimum.chi2[optimum.kept].sum(), rel=1e-9)
     assert np.all(optimum.chi2[false] > gate_of(graph, 0.99))
