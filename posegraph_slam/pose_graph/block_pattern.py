@@ -40,6 +40,13 @@ class BlockPattern:
     stack_sizes: IntArray
     """Entries that each of the stacks needs."""
 
+    @property
+    def work(self) -> float:
+        """Multiplications of a factorisation."""
+        tree = self.elimination
+        width, below = np.diff(tree.start) * self.block, np.diff(tree.row_start) * self.block
+        return float(np.sum(width * ((below + 0.5 * width) ** 2 + width**2 / 12.0)))
+
 
 def block_pattern(count: int, i: IntArray, j: IntArray, block: int, *, kept: BoolArray | None = None) -> BlockPattern:
     """Analyse a matrix of `count` block rows with off-diagonal blocks at (i, j) (E,), i != j.

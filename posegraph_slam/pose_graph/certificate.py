@@ -16,6 +16,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from posegraph_slam.arrays import BoolArray, FloatArray
 from posegraph_slam.errors import GraphError
+from posegraph_slam.execution import silent_progress
 from posegraph_slam.geometry import pose_from_rotation_translation
 from posegraph_slam.pose_graph.block_cholesky import factorize
 from posegraph_slam.pose_graph.block_pattern import BlockPattern, block_pattern
@@ -36,6 +37,8 @@ from posegraph_slam.pose_graph.chordal_cost import (
     value,
 )
 from posegraph_slam.pose_graph.graph import PoseGraph
+from posegraph_slam.pose_graph.solver_settings import SolverSettings
+from posegraph_slam.pose_graph.sparse_solver import run_sparse
 
 GAP_TOLERANCE = 1e-6
 """Largest relative gap between cost and lower bound that is called certified."""
@@ -43,7 +46,13 @@ PROOF_SHIFTS = (1e-10, 1e-9, 1e-8, 1e-7, 1e-6)
 """Shifts of S tried in turn, as the share of the cost that each takes from the lower bound."""
 COST_FLOOR = 1e-9
 """Gap, as a cost, that counts as none in graphs that fit perfectly."""
-NEWTON_ITERATIONS = 200
+FACTORISATIONS = 100
+"""Most of them in one minimisation, far more than proofs need that succeed."""
+CLIMB_WORK = 1e11
+"""Multiplications (some five seconds of them) that may be spent on higher ranks: where the relaxation is not tight, large
+graphs would take minutes."""
+LEAST_FACTORISATIONS = 20
+"""What a minimisation gets even if it spends more than that."""
 EXTRA_RANKS = 3
 LEVEL = 1e-13
 """Share of the cost below which a decrease drowns in rounding."""
@@ -92,6 +101,13 @@ class Certificate:
         return self.chordal_cost - self.lower_bound <= GAP_TOLERANCE * self.chordal_cost + COST_FLOOR
 
 
+@dataclass(slots=True)
+class Budget:
+    """Multiplications that are left to be spent."""
+
+    left: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Verdict:
     """Lower bound and smallest eigenvalue from S, with its eigenvector (n, d+1) where it is negative."""
@@ -101,8 +117,10 @@ class _Verdict:
     direction: FloatArray | None
 
 
-def certify(graph: PoseGraph) -> Certificate:
+def certify(graph: PoseGraph, *, from_relaxation: bool = False) -> Certificate:
     """Minimise the chordal cost from a graph's poses and prove the minimum global, climbing ranks where it is not.
+
+    `from_relaxation` says that the poses were reached from the chordal relaxation, which then is not tried again.
 
     The status is `CERTIFIED` if the minimum nearest to the poses is proven, `SUBOPTIMAL` if a better one is (its
     poses are in the answer), `UNKNOWN` with a reason otherwise. The gauge is that of the fixed nodes, one a part.
@@ -118,7 +136,8 @@ def certify(graph: PoseGraph) -> Certificate:
     first = _certificate(problem, at, cost, verdict)
     if first.proven or verdict.direction is None:
         return first
-    if (other := _from_relaxation(graph, problem, pattern)) is not None and other.proven:
+    other = None if from_relaxation else _from_relaxation(graph, problem, pattern)
+    if other is not None and other.proven:
         return with_status(other, CertificateStatus.SUBOPTIMAL, "a better basin was found")
     return _climb(problem, pattern, at, anchors, verdict, first)
 
@@ -126,9 +145,11 @@ def certify(graph: PoseGraph) -> Certificate:
 def _from_relaxation(graph: PoseGraph, problem: ChordalProblem, pattern: BlockPattern) -> Certificate | None:
     """Try the minimum next to the linear relaxation of rotations: nearly always the right one, and much cheaper."""
     try:
-        begin = lifted_poses(chordal_poses(graph))
+        start = graph.with_poses(chordal_poses(graph))
     except GraphError:
         return None
+    # The full cost first: Gauss-Newton steps find the basin that exact Newton steps wander about.
+    begin = lifted_poses(run_sparse(start, SolverSettings(relative_tolerance=1e-6), silent_progress).poses)
     at, cost = minimize_chordal(problem, begin, graph.fixed)
     return _certificate(problem, at, cost, _verdict(problem, pattern, at, graph.fixed))
 
@@ -154,13 +175,15 @@ def with_status(found: Certificate, status: CertificateStatus, reason: str) -> C
 def _climb(problem: ChordalProblem, pattern: BlockPattern, at: Lifted, anchors: BoolArray, verdict: _Verdict,
            first: Certificate) -> Certificate:  # fmt: skip
     """Descend at higher and higher rank until S is positive semidefinite, then round back to poses."""
+    budget = Budget(CLIMB_WORK)
     for _ in range(EXTRA_RANKS):
-        if verdict.direction is None:
+        if verdict.direction is None or budget.left <= 0:
             break
         at = _escape(problem, at, verdict.direction)
-        at, _ = minimize_chordal(problem, at, anchors)
+        at, _ = minimize_chordal(problem, at, anchors, budget=budget)
         verdict = _verdict(problem, pattern, at, anchors)
-    rounded, cost = minimize_chordal(problem, _rounded(problem, at, first.poses, anchors), anchors)
+    begin = _rounded(problem, at, first.poses, anchors)
+    rounded, cost = minimize_chordal(problem, begin, anchors, budget=budget)
     better = _certificate(problem, rounded, cost, verdict)
     found = better if cost < first.chordal_cost * (1 - 1e-9) else _certificate(
         problem, lifted_poses(first.poses), first.chordal_cost, verdict)  # fmt: skip
@@ -181,14 +204,21 @@ def _unfit(graph: PoseGraph) -> str | None:
     return None
 
 
-def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) -> tuple[Lifted, float]:
-    """Minimise F from lifted poses by damped Newton steps with the exact Hessian; `anchors` (n,) do not move."""
+def minimize_chordal(
+    problem: ChordalProblem, at: Lifted, anchors: BoolArray, *, budget: Budget | None = None
+) -> tuple[Lifted, float]:
+    """Minimise F from lifted poses by damped Newton steps with the exact Hessian; `anchors` (n,) do not move.
+
+    Multiplications are taken from the budget, and end with it after `LEAST_FACTORISATIONS`.
+    """
     d, rank = problem.dimension, at.Q.shape[1]
     basis = tangents(d, rank)
     pattern = block_pattern(len(anchors), problem.i, problem.j, len(basis.row), kept=~anchors)
     cost, G = value(problem, at)
     damping, before = 0.0, np.inf
-    for _ in range(NEWTON_ITERATIONS):
+    budget = Budget(np.inf) if budget is None else budget
+    done, work = 0, pattern.work
+    while done < LEAST_FACTORISATIONS or (done < FACTORISATIONS and budget.left > 0):
         gradient = tangent_gradient(at.Q, G, basis.row, basis.column, basis.sign)
         S = certificate_diagonal(problem, multipliers(at, G))
         diagonal, off = tangent_hessian(at.Q, problem.i, problem.j, S, problem.off_diagonal, basis.row, basis.column,
@@ -196,6 +226,7 @@ def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) ->
         least = 1e-10 * float(np.mean(np.abs(np.trace(problem.diagonal, axis1=1, axis2=2))))
         while True:
             factor = factorize(pattern, diagonal, off, damping)
+            done, budget.left = done + 1, budget.left - work
             if factor is not None:
                 delta = -solve_factored(pattern, factor, gradient)
                 predicted = -float(np.sum(delta * gradient))
@@ -204,7 +235,7 @@ def minimize_chordal(problem: ChordalProblem, at: Lifted, anchors: BoolArray) ->
                 if new_cost <= cost or predicted <= LEVEL * cost:
                     break
             damping = max(10 * damping, least)
-            if damping > 1e20 * least:
+            if damping > 1e20 * least or done >= FACTORISATIONS:
                 return at, cost
         at, cost, G = trial, new_cost, new_G
         damping = damping / 10 if damping > least else 0.0

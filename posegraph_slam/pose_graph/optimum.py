@@ -105,7 +105,8 @@ def find_optimum(
     certificate = None
     iterations = result.iterations
     if settings.certify and solver.robust.loss.value == "none":
-        result, certificate, extra = _certified(used, result, solver, progress)
+        relaxed = start is Start.CHORDAL
+        result, certificate, extra = _certified(used, result, solver, progress, from_relaxation=relaxed)
         iterations += extra
     seconds["certify"] = clock() - began
     solved = graph.with_poses(result.poses)
@@ -129,10 +130,10 @@ def _start(graph: PoseGraph, start: Start, *, robust: bool) -> tuple[FloatArray,
 
 
 def _certified(
-    graph: PoseGraph, result: SolveResult, solver: SolverSettings, progress: Progress
+    graph: PoseGraph, result: SolveResult, solver: SolverSettings, progress: Progress, *, from_relaxation: bool
 ) -> tuple[SolveResult, Certificate, int]:
     """Certify a solution; where the proven chordal optimum lies elsewhere, solve from there and keep the better one."""
-    certificate = certify(graph.with_poses(result.poses))
+    certificate = certify(graph.with_poses(result.poses), from_relaxation=from_relaxation)
     if not certificate.proven or certificate.rank == 0:
         return result, certificate, 0
     if certificate.status is CertificateStatus.CERTIFIED and _turn(result.poses, certificate.poses) < SAME_BASIN_RAD:
