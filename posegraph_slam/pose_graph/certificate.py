@@ -49,8 +49,8 @@ COST_FLOOR = 1e-9
 FACTORISATIONS = 100
 """Most of them in one minimisation, far more than proofs need that succeed."""
 CLIMB_WORK = 1e11
-"""Multiplications (some five seconds of them) that may be spent on higher ranks: where the relaxation is not tight, large
-graphs would take minutes."""
+"""Multiplications (some five seconds of them) that may be spent on higher ranks: without a limit, large graphs whose
+relaxation is not tight would take minutes."""
 LEAST_FACTORISATIONS = 20
 """What a minimisation gets even if it spends more than that."""
 EXTRA_RANKS = 3

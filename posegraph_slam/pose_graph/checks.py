@@ -104,12 +104,14 @@ def _check_information(graph: PoseGraph) -> None:
         edge = int(suspects[first])
         raise GraphError(edge_name(graph, edge), "its information is not symmetric", "give a symmetric matrix")
     eigenvalues = np.linalg.eigvalsh(suspect)
-    if (first := _first(eigenvalues[:, 0] <= DEFINITENESS_TOLERANCE * eigenvalues[:, -1])) is not None:
+    indefinite = eigenvalues[:, 0] <= DEFINITENESS_TOLERANCE * eigenvalues[:, -1]
+    if (first := _first(indefinite)) is not None:
+        others = int(indefinite.sum()) - 1
         raise GraphError(
             edge_name(graph, int(suspects[first])),
             f"its information is not positive definite (eigenvalues {eigenvalues[first, 0]:.3g} to "
-            f"{eigenvalues[first, -1]:.3g})",
-            "clamp its eigenvalues or remove the edge",
+            f"{eigenvalues[first, -1]:.3g})" + (f", nor is that of {others} other edges" if others else ""),
+            "clamp eigenvalues (psg solve --clamp) or remove the edge",
         )
 
 
@@ -178,5 +180,5 @@ def _check_connection(graph: PoseGraph) -> None:
     raise GraphError(
         "pose graph",
         f"it falls into {len(sizes)} disconnected parts of {largest} nodes, and the part of {member} has no fixed node",
-        "add constraints that join the parts, fix a node in each, or keep one part",
+        "add constraints that join the parts, fix a node in each, or choose (psg solve --component largest or all)",
     )

@@ -56,8 +56,8 @@ def cost_at(graph: PoseGraph, poses: FloatArray, robust: RobustSettings) -> floa
 def run_sparse(graph: PoseGraph, settings: SolverSettings, progress: Progress) -> OptimizerRun:
     """Iterate until the cost stops falling; same meaning as `run_gtsam`. Knows no Dogleg.
 
-    Near the optimum the gradient and the last factor tell what another step would save: that ends most runs one
-    factorisation earlier.
+    Near the optimum the gradient and the last factor give another step and what it saves, without a factorisation: if
+    that is below the tolerance, the step is the last.
     """
     begin = time.perf_counter()
     if graph.fixed.all():
@@ -65,7 +65,7 @@ def run_sparse(graph: PoseGraph, settings: SolverSettings, progress: Progress) -
     pattern, state = free_pattern(graph), _State(graph, np.array(graph.poses), settings)
     damped = settings.method is SolverMethod.LEVENBERG_MARQUARDT
     rows = [(state.cost, state.damping, time.perf_counter() - begin)]
-    reason, gain = StopReason.MAX_ITERATIONS, np.inf
+    reason, gain, left = StopReason.MAX_ITERATIONS, np.inf, None
     for iteration in range(settings.max_iterations):
         step = _step(graph, state, pattern, settings)
         progress("solve", iteration + 1, settings.max_iterations)
@@ -76,12 +76,15 @@ def run_sparse(graph: PoseGraph, settings: SolverSettings, progress: Progress) -
         rows.append((state.cost, state.damping, time.perf_counter() - begin))
         gain, tolerance = before - state.cost, settings.relative_tolerance * before + settings.absolute_tolerance
         near = gain * (gain / last if gain < last < np.inf else 1.0) <= SCREEN * tolerance
-        if gain <= tolerance or (near and state.promised(graph, pattern, settings) <= tolerance):
+        if gain > tolerance and near and (end := state.repeated(graph, pattern, settings, tolerance)) is not None:
+            left, state = state.possible_decrease(graph, settings), end
+            rows.append((state.cost, state.damping, time.perf_counter() - begin))
+            gain = 0.0
+        if gain <= tolerance:
             reason = StopReason.CONVERGED
             break
     costs, dampings, seconds = np.array(rows).T
     record = IterationRecord(cost=costs, lambda_=dampings if damped else np.full(len(rows), np.nan), seconds=seconds)
-    left = state.possible_decrease(graph, settings) if reason is StopReason.CONVERGED else None
     return OptimizerRun(poses=state.poses, stop_reason=reason, record=record, possible_decrease=left)
 
 
@@ -113,12 +116,18 @@ class _State:
             self._linear = normal_equations(self.poses, c, weights)
         return self._linear
 
-    def promised(self, graph: PoseGraph, pattern: BlockPattern, settings: SolverSettings) -> float:
-        """Return what another step would save, 1/2 g^T H^-1 g, with H from the last step."""
+    def repeated(
+        self, graph: PoseGraph, pattern: BlockPattern, settings: SolverSettings, tolerance: float
+    ) -> _State | None:
+        """Return the state after a step with the factor of the last one, None if it promises more than `tolerance`."""
         if self.factor is None:
-            return np.inf
+            return None
         gradient = self.linear(graph, settings).gradient
-        return 0.5 * float(np.sum(gradient * solve_factored(pattern, self.factor, gradient)))
+        delta = -solve_factored(pattern, self.factor, gradient)
+        if -0.5 * float(np.sum(gradient * delta)) > tolerance:
+            return None
+        end = _State(graph, moved_poses(self.poses, delta), settings, self.damping)
+        return end if end.cost < self.cost else self
 
     def possible_decrease(self, graph: PoseGraph, settings: SolverSettings) -> float:
         """Return what moving each node alone would save, to first order."""
