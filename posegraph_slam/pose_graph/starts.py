@@ -43,15 +43,17 @@ def starting_poses(graph: PoseGraph, start: Start) -> tuple[FloatArray, Start]:
     Raises `GraphError` for a graph that cannot be solved.
     """
     check_graph(graph)
+    return _best(graph) if start is Start.BEST else (_poses(graph, start), start)
+
+
+def _poses(graph: PoseGraph, start: Start) -> FloatArray:
     if start is Start.GIVEN:
-        return graph.poses, start
+        return graph.poses
     if start is Start.ODOMETRY:
-        return propagate_poses(graph.group, graph.poses, graph.fixed, graph.constraints), start
+        return propagate_poses(graph.group, graph.poses, graph.fixed, graph.constraints)
     if start is Start.SPANNING_TREE:
-        return spread_poses(graph.group, graph.poses, graph.fixed, graph.constraints), start
-    if start is Start.CHORDAL:
-        return chordal_poses(graph), start
-    return _best(graph)
+        return spread_poses(graph.group, graph.poses, graph.fixed, graph.constraints)
+    return chordal_poses(graph)
 
 
 def _best(graph: PoseGraph) -> tuple[FloatArray, Start]:
@@ -64,7 +66,7 @@ def _best(graph: PoseGraph) -> tuple[FloatArray, Start]:
     limit = np.inf
     for start in (Start.CHORDAL, Start.GIVEN, Start.ODOMETRY, Start.SPANNING_TREE):
         try:
-            poses, _ = starting_poses(graph, start)
+            poses = _poses(graph, start)
         except GraphError:
             continue
         cost = cost_at(graph, poses, settings.robust)
