@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from posegraph_slam.api import Run, optimize, read, simulate
+    from posegraph_slam.datasets.trajectory_files import read_trajectory, write_trajectory
     from posegraph_slam.errors import ConfigurationError, GraphError, InputError, PosegraphSlamError
     from posegraph_slam.geometry import Relations, Trajectory
     from posegraph_slam.mapping.occupancy import OccupancyGrid
@@ -38,11 +39,14 @@ __all__ = [
     "__version__",
     "optimize",
     "read",
+    "read_trajectory",
     "simulate",
+    "write_trajectory",
 ]
 
 _HOMES = {
     "api": ("Run", "optimize", "read", "simulate"),
+    "datasets.trajectory_files": ("read_trajectory", "write_trajectory"),
     "errors": ("ConfigurationError", "GraphError", "InputError", "PosegraphSlamError"),
     "geometry": ("Relations", "Trajectory"),
     "mapping.occupancy": ("OccupancyGrid",),

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Quiet
+from posegraph_slam.cli.arguments import Quiet, Verbose
 from posegraph_slam.cli.reporting import Run
 
 
@@ -17,6 +17,7 @@ def edit(
     ] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only; open no browser.")] = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Switch closures of a run off or on, propose new ones, and solve again, in the browser.
 

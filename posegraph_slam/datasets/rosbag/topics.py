@@ -109,7 +109,7 @@ def unused(bag: Bag, choice: Choice) -> list[Topic]:
 
 
 def _named(bag: Bag, role: str, name: str) -> Topic:
-    topic = bag.topics.get(name) or bag.topics.get(f"/{name}")
+    topic = bag.topics.get(name) or bag.topics.get(f"/{name}") or bag.topics.get(name.lstrip("/"))
     if topic is None:
         guess = did_you_mean(name, bag.topics)
         raise InputError(bag.path, f"has no topic {name} for '{role}'", f"{guess}it holds {bag.listing()}")
