@@ -28,6 +28,7 @@ Config = Annotated[
     typer.Option("--config", metavar="FILE|PRESET", help="TOML file or preset; repeatable, later ones win."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else on stdout.")]
+Page = Annotated[bool, typer.Option("--report/--no-report", help="Write report.html at the end.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Run directory.")]

@@ -14,6 +14,7 @@ from posegraph_slam.cli.arguments import (
     Log,
     Out,
     Overwrite,
+    Page,
     Quiet,
     Seed,
     Set,
@@ -44,6 +45,7 @@ def localize(
     log_format: Format = None,
     topic: Topic = None,
     seed: Seed = None,
+    page: Page = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -52,6 +54,7 @@ def localize(
     """Find a robot in a known map at every scan of its log, and say when its pose is not known."""
     from posegraph_slam.pipeline.configuration import load_configuration
     from posegraph_slam.pipeline.localize import run_localization
+    from posegraph_slam.report.page import write_report_of
 
     configuration = load_configuration(config or [], settings or [], seed=seed)
     with ProgressBars(enabled=not quiet) as progress:
@@ -64,6 +67,7 @@ def localize(
             overwrite=overwrite,
             log_format=log_format,
             topics=topic_names(topic),
+            report=write_report_of if page else None,
             progress=progress,
         )
     report(summary, show, quiet=quiet, as_json=as_json)

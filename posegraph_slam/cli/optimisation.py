@@ -14,6 +14,7 @@ from posegraph_slam.cli.arguments import (
     Json,
     Log,
     Overwrite,
+    Page,
     Quiet,
     Seed,
     Set,
@@ -50,7 +51,7 @@ def optimize(
     edits: Annotated[
         Path | None, typer.Option("--edits", metavar="FILE", help="With --from graph: closures edited by hand.")
     ] = None,
-    page: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html at the end.")] = True,
+    page: Page = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -59,7 +60,7 @@ def optimize(
     """Turn a log into an optimised trajectory and maps, in a run directory of its own."""
     from posegraph_slam.pipeline.rerun import plan_run
     from posegraph_slam.pipeline.run import run
-    from posegraph_slam.report.page import REPORT, write_report_of
+    from posegraph_slam.report.page import write_report_of
     from posegraph_slam.report.run_figures import draw_figures
 
     plan = plan_run(
@@ -92,8 +93,6 @@ def optimize(
     report(summary, partial(show, verbose=verbose), quiet=quiet, as_json=as_json)
     for picture in () if quiet or as_json else sorted(summary.folder.glob("figures/*.png")):
         typer.echo(f"picture:  {picture}")
-    if page and not (quiet or as_json):
-        typer.echo(f"report:   {summary.folder / REPORT}")
 
 
 def default_out(log: Path) -> Path:

@@ -11,6 +11,7 @@ from posegraph_slam.cli.arguments import (
     Log,
     Out,
     Overwrite,
+    Page,
     Quiet,
     Seed,
     Set,
@@ -33,6 +34,7 @@ def pf_slam(
     log_format: Format = None,
     topic: Topic = None,
     seed: Seed = None,
+    page: Page = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -41,6 +43,7 @@ def pf_slam(
     """Map a log with a particle filter: no graph, no loop closures; a baseline, and a way to learn."""
     from posegraph_slam.pipeline.configuration import load_configuration
     from posegraph_slam.pipeline.particle_slam import run_particle_slam
+    from posegraph_slam.report.page import write_report_of
 
     configuration = load_configuration(config or [], settings or [], seed=seed)
     with ProgressBars(enabled=not quiet) as progress:
@@ -51,6 +54,7 @@ def pf_slam(
             overwrite=overwrite,
             log_format=log_format,
             topics=topic_names(topic),
+            report=write_report_of if page else None,
             progress=progress,
         )
     report(summary, show, quiet=quiet, as_json=as_json)

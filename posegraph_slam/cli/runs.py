@@ -17,6 +17,8 @@ Outcome = TypeVar("Outcome", bound="RunOutcome")
 
 def report(outcome: Outcome, show: Callable[[Outcome], None], *, quiet: bool, as_json: bool) -> None:
     """Print a run as JSON, or its remarks (on stderr), what `show` prints of it, and where its results lie."""
+    from posegraph_slam.pipeline.run_directory import REPORT
+
     if as_json:
         print_json({"folder": str(outcome.folder), "metrics": outcome.metrics, "run": outcome.record})
     elif not quiet:
@@ -24,3 +26,5 @@ def report(outcome: Outcome, show: Callable[[Outcome], None], *, quiet: bool, as
             print_note(remark)
         show(outcome)
         typer.echo(f"\nresults:  {outcome.folder}")
+        if (outcome.folder / REPORT).is_file():
+            typer.echo(f"report:   {outcome.folder / REPORT}")

@@ -20,7 +20,7 @@ from posegraph_slam.odometry.scan_matching import match_scans
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.optimize import usable_scans
-from posegraph_slam.pipeline.recording import RunOutcome, recorded_run
+from posegraph_slam.pipeline.recording import Report, RunOutcome, recorded_run
 from posegraph_slam.pipeline.run_directory import METRICS, RunDirectory
 from posegraph_slam.pipeline.run_record import fingerprint
 from posegraph_slam.registration.beam_scans import BeamScans, prepare_beam_scans
@@ -69,6 +69,7 @@ def run_localization(
     overwrite: bool = False,
     log_format: str | None = None,
     topics: Mapping[str, str] | None = None,
+    report: Report | None = None,
     progress: Progress = silent_progress,
     command: Sequence[str] | None = None,
 ) -> RunOutcome:
@@ -83,6 +84,7 @@ def run_localization(
         overwrite=overwrite,
         log_format=log_format,
         topics=topics,
+        report=report,
         command=command,
     ) as run:
         with run.clock.stage("reading"):

@@ -16,7 +16,7 @@ from posegraph_slam.mapping.crispness import crispness
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.optimize import usable_scans
-from posegraph_slam.pipeline.recording import RunSummary, recorded_run
+from posegraph_slam.pipeline.recording import Report, RunSummary, recorded_run
 from posegraph_slam.pipeline.run_directory import METRICS
 from posegraph_slam.pipeline.saving import save_occupancy
 from posegraph_slam.sensors import RobotLog
@@ -30,6 +30,7 @@ def run_particle_slam(
     overwrite: bool = False,
     log_format: str | None = None,
     topics: Mapping[str, str] | None = None,
+    report: Report | None = None,
     progress: Progress = silent_progress,
     command: Sequence[str] | None = None,
 ) -> RunSummary:
@@ -44,6 +45,7 @@ def run_particle_slam(
         overwrite=overwrite,
         log_format=log_format,
         topics=topics,
+        report=report,
         command=command,
     ) as run:
         scans = usable_scans(run.log)

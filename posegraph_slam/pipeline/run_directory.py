@@ -25,6 +25,7 @@ from posegraph_slam.pipeline.configuration import Configuration, load_configurat
 from posegraph_slam.pipeline.settings_files import to_toml
 
 RECORD, CONFIGURATION, METRICS, LOOPS = "run.json", "config.toml", "metrics.json", "loops.csv"
+REPORT = "report.html"
 EDITS, APPLIED_EDITS = "edits.toml", "applied_edits.toml"
 """A person's edits of this run, and those of another run that this one was made with."""
 FORMAT_VERSION = 1

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.style
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
-from posegraph_slam.arrays import FloatArray
 from posegraph_slam.files import replacing
 
 # Okabe and Ito 2008: told apart with every common kind of colour vision
@@ -80,11 +78,3 @@ def round_length(length_m: float) -> float:
     """Return the largest 1, 2 or 5 times a power of ten that is not above `length_m`."""
     power = 10.0 ** math.floor(math.log10(length_m))
     return next(step * power for step in (5.0, 2.0, 1.0) if step * power <= length_m * (1 + 1e-9))
-
-
-def bounds_around(points_m: FloatArray, *, margin: float = 0.05) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top around points (n, 2), with a margin in parts of the larger side."""
-    finite = points_m[np.isfinite(points_m).all(axis=1)]
-    low, high = (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(2), np.zeros(2))
-    space = margin * max(float((high - low).max()), 1.0)
-    return float(low[0] - space), float(high[0] + space), float(low[1] - space), float(high[1] + space)

@@ -17,21 +17,9 @@ from posegraph_slam.evaluation.rpe import RelativePoseError
 from posegraph_slam.files import replacing
 from posegraph_slam.geometry import Trajectory
 from posegraph_slam.mapping.occupancy import OccupancyGrid
-from posegraph_slam.report.canvas import (
-    BLACK,
-    BLUE,
-    DPI,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    bounds_around,
-    page,
-)
+from posegraph_slam.report.canvas import BLACK, BLUE, DPI, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, page
 from posegraph_slam.report.figures import PIXELS, UNKNOWN_GREY
-from posegraph_slam.report.view import View
+from posegraph_slam.report.view import View, bounds_around
 
 RUN_COLOURS = (BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY, BLACK, GREY)
 PANELS_A_ROW = 3

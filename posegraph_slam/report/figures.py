@@ -17,19 +17,8 @@ from posegraph_slam.geometry import Trajectory, align_points, interpolate
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
-from posegraph_slam.report.canvas import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    bounds_around,
-    page,
-)
-from posegraph_slam.report.view import View
+from posegraph_slam.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, page
+from posegraph_slam.report.view import View, bounds_around
 
 STAGE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": ORANGE, "linestyle": (0, (4, 1.5)), "linewidth": 1.1},

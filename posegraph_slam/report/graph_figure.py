@@ -9,7 +9,8 @@ from matplotlib.collections import LineCollection
 
 from posegraph_slam.arrays import BoolArray
 from posegraph_slam.pose_graph.graph import PoseGraph
-from posegraph_slam.report.canvas import BLUE, GREY, VERMILLION, bounds_around, page
+from posegraph_slam.report.canvas import BLUE, GREY, VERMILLION, page
+from posegraph_slam.report.view import bounds_around
 
 
 def draw_graph(graph: PoseGraph, path: Path, *, kept: BoolArray | None = None, title: str = "") -> None:

@@ -16,15 +16,16 @@ from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.pipeline.stored_graph import StoredGraph
 from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
 from posegraph_slam.pose_graph.residuals import chi2
-from posegraph_slam.report.canvas import bounds_around
 from posegraph_slam.report.markup import data_uri
 from posegraph_slam.report.run_content import RunContent
-from posegraph_slam.report.view import View
+from posegraph_slam.report.view import View, bounds_around
 
 PATH_POINTS = 4000
 """Points of a trajectory at most: about one a pixel of a wide screen."""
 OVERLAPS_SHOWN, REJECTED_SHOWN = 20_000, 20_000
 """Edges of a layer at most; of the overlaps those that fit worst, of the rejected candidates the last ones."""
+TEXTURE_BYTES = 3_000_000
+"""A texture map takes no more than this; every halving of its sides leaves about a quarter."""
 OUTSIDE_SHARE = 0.01
 UNSEEN_PIXEL = 128
 """Grey of a cell that was never seen; no other cell has it."""
@@ -68,9 +69,18 @@ def picture_layers(grid: OccupancyGrid, texture: ByteArray | None = None) -> dic
     extent = [round(float(side), 4) for side in view.extent_m]
     layers = {"occupancy": {"png": data_uri(png_bytes(grey[::-1])), "extent": extent}}
     if texture is not None and bool(texture[..., 3].any()):
-        pixels = view.samples(texture[::-1])[::-1]
-        layers["texture"] = {"png": data_uri(png_bytes(pixels)), "extent": extent}
+        layers["texture"] = {"png": data_uri(texture_png(view.samples(texture[::-1])[::-1])), "extent": extent}
     return layers
+
+
+def texture_png(pixels: ByteArray) -> bytes:
+    """Encode a texture (rows, columns, 4), coarser where it would make the page too large to mail."""
+    content = png_bytes(pixels)
+    while len(content) > TEXTURE_BYTES:
+        rows, columns = (size - size % 2 for size in pixels.shape[:2])
+        pixels = pixels[:rows:2, :columns:2]
+        content = png_bytes(pixels)
+    return content
 
 
 def path_layer(name: str, trajectory: Trajectory) -> dict[str, Any]:

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from posegraph_slam.files import replacing
-from posegraph_slam.pipeline.run_directory import RunDirectory
+from posegraph_slam.pipeline.run_directory import REPORT, RunDirectory
 from posegraph_slam.report import sections
 from posegraph_slam.report.map_layers import map_layers
 from posegraph_slam.report.markup import Markup, asset, content_hash, fill, join, json_block
 from posegraph_slam.report.run_content import RunContent, read_run_content
 
-REPORT = "report.html"
 STYLE, SCRIPTS, EDITOR_SCRIPTS = "report.css", ("map.js", "report.js"), ("edit.js",)
 
 

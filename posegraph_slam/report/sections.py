@@ -134,7 +134,7 @@ def closures(content: RunContent) -> Markup | None:
     if why:
         parts += [
             element("h3", "Why candidates were refused"),
-            table(["reason", "candidates", ""], why, caption="Reasons of refusal", class_="numbers"),
+            table(["reason", "count", ""], why, caption="Reasons of refusal", class_="numbers"),
         ]
     return section("Loop closures", "closures", *parts)
 

@@ -58,3 +58,11 @@ def _span(used: BoolArray) -> slice:
     if len(index) == 0:
         return slice(0, len(used))
     return slice(max(int(index[0]) - MARGIN_CELLS, 0), min(int(index[-1]) + 1 + MARGIN_CELLS, len(used)))
+
+
+def bounds_around(points_m: FloatArray, *, margin: float = 0.05) -> tuple[float, float, float, float]:
+    """Return left, right, bottom and top around points (n, 2), with a margin in parts of the larger side."""
+    finite = points_m[np.isfinite(points_m).all(axis=1)]
+    low, high = (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(2), np.zeros(2))
+    space = margin * max(float((high - low).max()), 1.0)
+    return float(low[0] - space), float(high[0] + space), float(low[1] - space), float(high[1] + space)

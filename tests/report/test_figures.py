@@ -14,9 +14,9 @@ from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
-from posegraph_slam.report.canvas import BLACK, BLUE, GREEN, ORANGE, SKY, bounds_around, round_length
+from posegraph_slam.report.canvas import BLACK, BLUE, GREEN, ORANGE, SKY, round_length
 from posegraph_slam.report.figures import align_truth, draw_map, draw_texture, draw_trajectories, loop_segments
-from posegraph_slam.report.view import MAXIMUM_PIXELS, View
+from posegraph_slam.report.view import MAXIMUM_PIXELS, View, bounds_around
 
 
 def trajectory(xyt: np.ndarray) -> Trajectory:
