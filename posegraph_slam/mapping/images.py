@@ -41,5 +41,5 @@ def read_image(path: Path) -> ByteArray:
     if pixels is None:
         raise InputError(path, "is not an image that can be decoded", "the file may be truncated or of another type")
     if pixels.ndim == 3:
-        pixels = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2)
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)
     return read_only(pixels, pixels.dtype)

@@ -176,6 +176,22 @@ def test_threshold_and_depth_limits_select_the_floor(drive):
     assert 0 < near.observed.sum() < build_texture(frames, path).observed.sum()
 
 
+def test_the_floor_rises_with_the_robot(drive):
+    """On a path in space, 2 m up and tilted, the floor under the robot is the same floor."""
+    frames, path = drive
+    poses = spatial_from_planar(path.poses)
+    lift = np.eye(4)
+    lift[:3, :3] = [[math.cos(0.3), 0, -math.sin(0.3)], [0, 1, 0], [math.sin(0.3), 0, math.cos(0.3)]]
+    lift[2, 3] = 2.0
+    level, lifted = (
+        build_texture(frames, Trajectory(stamps_s=path.stamps_s, poses=T, parent="map", child="base"))
+        for T in (poses, lift @ poses)
+    )
+    share = lifted.observed.sum() / level.observed.sum()
+    assert 0.9 < share / math.cos(0.3) < 1.1
+    assert lifted.frames_used == 3
+
+
 def test_frames_that_are_absent_or_far_in_time_are_skipped_and_counted(drive):
     frames, path = drive
     absent = replaced(frames, disparity_files=(None, *frames.disparity_files[1:]))
