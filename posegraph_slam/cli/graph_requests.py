@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from posegraph_slam.errors import ConfigurationError, InputError
+from posegraph_slam.errors import ConfigurationError, InputError, did_you_mean
 from posegraph_slam.pose_graph.editing import (
     Component,
     add_edge,
@@ -28,15 +29,27 @@ KINDS = {"odometry": ConstraintKind.ODOMETRY, "external": ConstraintKind.EXTERNA
 """Kinds that a graph file can hold: edges between successive ids, and all others."""
 
 
+OPTIONS = {
+    "start": "--init",
+    "solver.method": "--method",
+    "solver.kind": "--solver",
+    "solver.max_iterations": "--max-iterations",
+    "outliers.method": "--robust",
+    "outliers.parameter": "--robust-parameter",
+}
+"""The option behind each setting."""
+
+
 def optimum_settings(values: dict[str, Any]) -> OptimumSettings:
     """Check the values of the options; the first fault is named."""
     try:
         return OptimumSettings.model_validate(values)
     except ValidationError as error:
         fault = error.errors()[0]
-        raise ConfigurationError(
-            "psg solve", f"{fault['loc'][-1]} = {fault['input']!r}: {fault['msg']}", "see psg solve --help"
-        ) from None
+        option = OPTIONS.get(".".join(map(str, fault["loc"])), "psg solve")
+        words = re.findall(r"'(\w+)'", str(fault.get("ctx", {}).get("expected", "")))
+        remedy = f"{did_you_mean(str(fault['input']), words)}it is {', '.join(words)}" if words else fault["msg"]
+        raise ConfigurationError(option, f"{fault['input']!r} is not allowed", remedy) from None
 
 
 def edited(
@@ -61,7 +74,8 @@ def edited(
         notes += [change.note] if change.note else []
     if component is not None:
         if component not in list(Component):
-            raise ConfigurationError("--component", f"{component!r} is unknown", "give largest or all")
+            guess = did_you_mean(component, list(Component))
+            raise ConfigurationError("--component", f"{component!r} is unknown", f"{guess}give largest or all")
         change = keep_component(graph, Component(component))
         graph = change.graph
         notes += [change.note] if change.note else []
@@ -71,7 +85,8 @@ def edited(
 def _without_edges(graph: PoseGraph, edges: Sequence[str], kinds: Sequence[str]) -> PoseGraph:
     unknown = [kind for kind in kinds if kind not in KINDS]
     if unknown:
-        raise ConfigurationError("--drop-kind", f"{unknown[0]!r} is unknown", "give " + " or ".join(KINDS))
+        remedy = f"{did_you_mean(unknown[0], KINDS)}give {' or '.join(KINDS)}"
+        raise ConfigurationError("--drop-kind", f"{unknown[0]!r} is unknown", remedy)
     numbers: list[int] = []
     for word in edges:
         values = _numbers("--drop-edge", word, int)

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from posegraph_slam.errors import ConfigurationError
+from posegraph_slam.errors import ConfigurationError, did_you_mean
 from posegraph_slam.settings import Settings
 
 Model = TypeVar("Model", bound=Settings)
@@ -136,11 +136,21 @@ def _explain(model: type[Settings], error: ValidationError, sources: Mapping[str
         where = ", ".join(touched) or "configuration"
         return ConfigurationError(where, f"{section or 'configuration'}: {_sentence(first['msg'])}{more}")
     given = json.dumps(first["input"], default=str)
+    guess = did_you_mean(str(first["input"]), choices(fields[dotted].annotation))
     return ConfigurationError(
         sources.get(dotted, "configuration"),
         f"'{dotted}' = {given} is not allowed",
-        f"it must be {allowed(fields[dotted])}{more}",
+        f"{guess}it must be {allowed(fields[dotted])}{more}",
     )
+
+
+def choices(annotation: Any) -> list[str]:
+    """Return the words that a field of a Literal or Enum type takes, none for other types."""
+    if isinstance(annotation, type) and issubclass(annotation, Enum):
+        return [str(member.value) for member in annotation]
+    if typing.get_origin(annotation) is typing.Literal:
+        return [str(choice) for choice in typing.get_args(annotation)]
+    return [word for argument in typing.get_args(annotation) for word in choices(argument)]
 
 
 def _sentence(message: str) -> str:

@@ -88,11 +88,17 @@ def test_presets_are_listed_as_json() -> None:
         (["optimize", "LOG", "--format", "carmenn"], "did you mean 'carmen'?"),
         (["inspect", "LOG", "--topic", "scn=/scan"], "did you mean 'scan'?"),
         (["convert", "LOG", "x", "--to", "kiti"], "did you mean 'kitti'?"),
+        (["optimize", "LOG", "--set", "odometry.source=whels"], "did you mean 'wheels'?"),
+        (["solve", "GRAPH", "--init", "chordl"], "--init: 'chordl' is not allowed; did you mean 'chordal'?"),
+        (["solve", "GRAPH", "--robust", "hubr"], "--robust: 'hubr' is not allowed; did you mean 'huber'?"),
+        (["solve", "GRAPH", "--component", "larges"], "did you mean 'largest'?"),
+        (["solve", "GRAPH", "--drop-kind", "odometri"], "did you mean 'odometry'?"),
         (["evaluate", "LOG", "LOG", "--align", "se4"], "did you mean 'se"),
     ],
 )
-def test_the_nearest_name_is_suggested(arguments: list[str], hint: str, log: Path) -> None:
-    result = psg(*(str(log) if argument == "LOG" else argument for argument in arguments))
+def test_the_nearest_name_is_suggested(arguments: list[str], hint: str, log: Path, run: Path) -> None:
+    meant = {"LOG": log, "GRAPH": run / "graph.g2o"}
+    result = psg(*(meant.get(argument, argument) for argument in arguments))
     assert result.exit_code == 2
     assert hint in result.stderr
 

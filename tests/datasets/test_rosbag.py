@@ -43,6 +43,12 @@ def scans_of(log: RobotLog) -> LaserScans:
     return log.scans
 
 
+def seen(numbers: range) -> np.ndarray:
+    """Ranges (N, B) of scans: what was written, and the maximum range where there was no return."""
+    ranges = np.array([ranges_at(k) for k in numbers], np.float32)
+    return np.where(np.isinf(ranges), np.float32(20.0), ranges)
+
+
 def poses_at(count: int) -> np.ndarray:
     return np.array([pose_from_xyt(np.array(xyt_at(k))) for k in range(count)])
 
@@ -64,7 +70,7 @@ def test_every_storage_and_compression_gives_the_same_log(storage: str, tmp_path
     assert (log.format, len(scans)) == ("rosbag", COUNT)
     stamps = np.array([stamp_at(k) * 1e-9 for k in range(COUNT)])
     np.testing.assert_allclose(scans.stamps_s, stamps, atol=1e-6)
-    np.testing.assert_array_equal(scans.ranges_m, np.array([ranges_at(k) for k in range(COUNT)], np.float32))
+    np.testing.assert_array_equal(scans.ranges_m, seen(range(COUNT)))
     np.testing.assert_allclose(scans.angles_rad[[0, -1]], [-1.5, 1.5], atol=1e-6)
     assert (scans.range_min_m, scans.range_max_m) == (pytest.approx(0.1), 20.0)
     footprint = mounting((0, 0, 0.1), (0, 0, 0)) @ mounting(*LASER_ON_BASE)
@@ -184,7 +190,7 @@ def test_the_first_echo_of_each_beam_counts(tmp_path: Path) -> None:
     kind = "sensor_msgs/msg/MultiEchoLaserScan"
     entries: list[Entry] = [("/scan", kind, stamp_at(k), maker.echoes(stamp_at(k), ranges_at(k))) for k in range(3)]
     scans = scans_of(read_entries(tmp_path, entries))
-    np.testing.assert_array_equal(scans.ranges_m[2], ranges_at(2).astype(np.float32))
+    np.testing.assert_array_equal(scans.ranges_m, seen(range(3)))
 
 
 def test_clouds_become_planar_scans_of_what_stands_at_the_height_of_the_sensor(tmp_path: Path) -> None:
@@ -324,7 +330,7 @@ def test_messages_that_overtook_each_other_are_put_in_order(tmp_path: Path) -> N
         ("/scan", SCAN, START_NS + at * LATENCY_NS, maker.scan(stamp_at(k), ranges_at(k))) for at, k in enumerate(order)
     ]
     log = read_entries(tmp_path, entries)
-    np.testing.assert_array_equal(scans_of(log).ranges_m, np.array([ranges_at(k) for k in range(4)], np.float32))
+    np.testing.assert_array_equal(scans_of(log).ranges_m, seen(range(4)))
     assert any("1 messages of /scan are out of order" in remark for remark in log.remarks)
 
 

@@ -71,6 +71,7 @@ def _laser(
     stamps, order = message_order(path, topic, stamps, recorded, remarks)
     if limits[0] >= limits[1]:
         raise InputError(path, f"topic {topic}: range_min {limits[0]:g} and range_max {limits[1]:g} leave no range")
+    np.copyto(ranges, np.float32(limits[1]), where=np.isposinf(ranges))  # REP 117: infinity is no return
     in_order = bool((np.diff(order) == 1).all())
     return LaserScans(
         stamps_s=stamps if in_order else stamps[order],
