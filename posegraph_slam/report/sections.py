@@ -54,7 +54,7 @@ def figures(content: RunContent) -> Markup:
         *(
             element(
                 "div",
-                element("dt", figure.label),
+                element("dt", figure.label[:1].upper() + figure.label[1:]),
                 element("dd", figure.value),
                 element("dd", figure.note, class_="note") if figure.note else None,
             )

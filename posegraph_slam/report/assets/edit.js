@@ -164,7 +164,7 @@ class Editor {
       this.tell(`Refused: ${found.reason}.`, true);
       return;
     }
-    const evidence = `${Math.round(100 * found.matched)} % of the points match, residual ${found.rmse_mm} mm, ${found.moved_m} m from the estimate`;
+    const evidence = `${Math.min(100, Math.round(100 * found.matched))} % of the points match, residual ${found.rmse_mm} mm, ${found.moved_m} m from the estimate`;
     if (found.surprise && !confirm(`The scans match (${evidence}), but the closure ${found.surprise}. Add it all the same?`)) {
       this.tell(`Not added: it ${found.surprise}.`);
       return;

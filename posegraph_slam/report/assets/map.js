@@ -242,7 +242,9 @@ class RunMap {
     }
     const crowding = Math.sqrt(200 / Math.max(drawn, 200));
     const lineWidth = dots ? Math.max(width * crowding, 0.9) : width;
-    for (const [colour, edges] of byColour) {
+    // the worst are drawn last, over the others
+    const groups = [...byColour].sort(([, a], [, b]) => (a[0].sigma ?? 0) - (b[0].sigma ?? 0));
+    for (const [colour, edges] of this.colourBy === "chi2" ? groups : byColour) {
       c.beginPath();
       for (const edge of edges) {
         c.moveTo(this.px(this.nodes.x[edge.i]), this.py(this.nodes.y[edge.i]));
@@ -254,7 +256,7 @@ class RunMap {
       c.lineWidth = lineWidth;
       c.stroke();
       c.setLineDash([]);
-      if (dots) this.drawDots(edges, 2.4 * crowding + 0.6, colour === "off" ? this.colour("rejected") : colour);
+      if (dots) this.drawDots(edges, Math.min(Math.max(0.12 * this.view.scale, 1), 2.4 * crowding + 0.6), colour === "off" ? this.colour("rejected") : colour);
       c.globalAlpha = 1;
     }
   }

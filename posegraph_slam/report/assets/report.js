@@ -136,7 +136,7 @@ class Report {
     if (edge.layer === "overlaps") return ["Overlap", ` of ${scans}: ${edge.sigma.toFixed(1)} σ from the solution.`];
     const kind = words(edge.kind);
     const measured = [];
-    if (edge.matched) measured.push(`${Math.round(100 * edge.matched)} % of the points match`);
+    if (edge.matched) measured.push(`${Math.min(100, Math.round(100 * edge.matched))} % of the points match`);
     if (edge.matched && edge.rmse_mm !== null) measured.push(`residual ${edge.rmse_mm} mm`);
     if (edge.accepted && edge.moved_m !== null) measured.push(`it lay ${edge.moved_m.toFixed(2)} m and ${edge.moved_deg.toFixed(1)}° from the estimate when it was found`);
     const evidence = measured.length ? ` ${measured.join(", ")}.` : "";
