@@ -14,16 +14,16 @@ from posegraph_slam.evaluation.tables import ComparisonTable
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.geometry import Trajectory
 from posegraph_slam.jit import measure_compile_time
+from posegraph_slam.mapping.colour_cloud import ColourCloud
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.mapping.texture import TextureMap
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration, load_configuration, usable_workers
 from posegraph_slam.pipeline.executors import open_executor
-from posegraph_slam.pipeline.optimize import OptimizationResult
-from posegraph_slam.pipeline.optimize import optimize as optimize_log
+from posegraph_slam.pipeline.jobs import JobResult, optimize_log, save_job
+from posegraph_slam.pipeline.optimize_rgbd import RgbdResult
 from posegraph_slam.pipeline.run_directory import RECORD, create_run_directory
 from posegraph_slam.pipeline.run_record import run_record
-from posegraph_slam.pipeline.saving import save_run
 from posegraph_slam.pose_graph.graph import PoseGraph
 from posegraph_slam.sensors import RobotLog
 
@@ -37,7 +37,7 @@ class Run:
 
     log: RobotLog
     configuration: Configuration
-    result: OptimizationResult
+    result: JobResult
     _clock: StageClock = field(repr=False)
     _compile_s: float = field(repr=False)
 
@@ -53,13 +53,18 @@ class Run:
 
     @property
     def map(self) -> OccupancyGrid | None:
-        """The occupancy map from the optimised trajectory; None where `maps` is off."""
-        return self.result.occupancy
+        """The occupancy map from the optimised trajectory; None where `maps` is off, and for RGB-D logs."""
+        return None if isinstance(self.result, RgbdResult) else self.result.occupancy
 
     @property
     def texture(self) -> TextureMap | None:
         """The coloured floor; None where the log has no images."""
-        return self.result.texture
+        return None if isinstance(self.result, RgbdResult) else self.result.texture
+
+    @property
+    def cloud(self) -> ColourCloud | None:
+        """The coloured cloud of an RGB-D log; None for other logs, and where `maps` is off."""
+        return self.result.cloud if isinstance(self.result, RgbdResult) else None
 
     @property
     def graph(self) -> PoseGraph:
@@ -90,7 +95,7 @@ class Run:
         with create_run_directory(Path(folder), overwrite=overwrite) as directory:
             with clock.stage("saving"):
                 directory.write_configuration(self.configuration)
-                save_run(self.result, directory)
+                save_job(self.result, directory)
             if figures:
                 with clock.stage("figures"):
                     draw_figures(self.result, directory)

@@ -38,8 +38,10 @@ HOMES = {
     "cv2": (
         "datasets/rosbag/images.py",
         "datasets/simulation/files.py",
+        "datasets/simulation/rgbd_room.py",
         "localization/free_space.py",
         "mapping/images.py",
+        "registration/features.py",
     ),
     "open3d": (),
     "evo": (),  # GPL: an oracle in the tests, never a part of the package

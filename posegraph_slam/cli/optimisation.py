@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -36,6 +37,9 @@ def optimize(
     settings: Set = None,
     truth: Annotated[Path | None, typer.Option("--truth", help="File of true poses: TUM, KITTI, EuRoC or CSV.")] = None,
     log_format: Format = None,
+    camera: Annotated[
+        Path | None, typer.Option("--camera", help="File of intrinsics for RGB-D images (JSON, or ROS' YAML).")
+    ] = None,
     topic: Topic = None,
     seed: Seed = None,
     workers: Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")] = None,
@@ -63,6 +67,8 @@ def optimize(
     from posegraph_slam.report.page import write_report_of
     from posegraph_slam.report.run_figures import draw_figures
 
+    if camera is not None:
+        settings = [*(settings or []), f"rgbd.camera.file={json.dumps(str(camera))}"]
     plan = plan_run(
         log,
         config or [],

@@ -113,6 +113,8 @@ def stream_stamps(log: RobotLog) -> dict[str, FloatArray]:
     """Return the stamps of every stream that was recorded, the reference stream (scans when there are any) first."""
     streams = {"scans": log.scans, "encoders": log.encoders, "imu": log.imu, "odometry": log.odometry}
     stamps = {name: stream.stamps_s for name, stream in streams.items() if stream is not None}
+    if log.rgbd_sequence is not None:
+        stamps["images"] = log.rgbd_sequence.stamps_s
     if log.rgbd is not None:
         stamps |= {"disparity": log.rgbd.disparity_stamps_s, "colour": log.rgbd.colour_stamps_s}
     return stamps | {f"images {camera.name}": camera.stamps_s for camera in log.images}
@@ -173,6 +175,8 @@ def _warnings(log: RobotLog, stamps: dict[str, FloatArray]) -> list[str]:
     found = list(uneven_coverage(stamps))
     for name, values in stamps.items():
         found += suspicious_clock(name, values)
+    if log.rgbd_sequence is not None and log.scans is None:
+        return found
     if log.scans is None or not len(log.scans):
         found.append("there are no laser scans: the log can be inspected but not optimised")
     else:

@@ -96,6 +96,11 @@ BUILT_IN = (
         "IMU and true poses of a EuRoC recording (ASL format); its cameras are not read",
         "the folder that holds mav0, mav0 itself, or the data.csv of an imu0",
     ),
+    _built_in(
+        "rgbd",
+        "RGB-D camera in motion: colour images and 16-bit depth registered to them (TUM RGB-D benchmark, Open3D)",
+        "a folder with rgb.txt and depth.txt, or with folders of images: color (or rgb, image) and depth",
+    ),
 )
 
 

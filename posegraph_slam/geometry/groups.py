@@ -34,6 +34,14 @@ class Group:
     adjoint: Callable[[FloatArray], FloatArray]
     right_jacobian: Callable[[FloatArray], FloatArray]
 
+    def rotation_part(self, tangent: FloatArray) -> FloatArray:
+        """Return the rotation (..., p - d) of pose tangents (..., p), which is last in SE(2) and first in SE(3)."""
+        return tangent[..., 2:] if self.dimension == 2 else tangent[..., :3]
+
+    def translation_part(self, tangent: FloatArray) -> FloatArray:
+        """Return the translation (..., d) of pose tangents (..., p)."""
+        return tangent[..., :2] if self.dimension == 2 else tangent[..., 3:]
+
     def identity(self, *batch: int) -> FloatArray:
         """Return stacked identities of shape (*batch, n, n)."""
         return np.broadcast_to(np.eye(self.matrix_size), (*batch, self.matrix_size, self.matrix_size)).copy()

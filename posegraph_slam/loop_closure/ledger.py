@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -65,15 +66,11 @@ class Ledger:
     ) -> None:
         """Enter one row a candidate; those without a reason are taken to be in the graph, in this order."""
         for m in range(len(candidates)):
-            key = (int(candidates.target[m]), int(candidates.source[m]))
-            self._travel_tried[key] = float(candidates.travel_m[m])
-            if not reasons[m]:
-                self.rows_in_graph.append(len(self.records))
-            self.records.append(
+            self.enter(
                 LoopRecord(
                     round=round_,
-                    target=key[0],
-                    source=key[1],
+                    target=int(candidates.target[m]),
+                    source=int(candidates.source[m]),
                     kind=ConstraintKind(int(candidates.kind[m])).name.lower(),
                     travel_m=float(candidates.travel_m[m]),
                     reach_m=float(candidates.reach_m[m]),
@@ -91,12 +88,19 @@ class Ledger:
                 )
             )
 
+    def enter(self, record: LoopRecord) -> None:
+        """Enter one row; one that is accepted is taken to be in the graph, after those entered before."""
+        self._travel_tried[record.target, record.source] = record.travel_m
+        if record.accepted:
+            self.rows_in_graph.append(len(self.records))
+        self.records.append(record)
+
     def settle(self, sigmas: FloatArray, kept: BoolArray) -> None:
         """Write how far the closures in the graph are from its solution, and drop those not kept."""
         for k, row in enumerate(self.rows_in_graph):
             old = self.records[row]
             reason = "" if kept[k] else f"disagrees with the solved graph by {sigmas[k]:.1f} sigma"
-            values = {name: getattr(old, name) for name in LoopRecord.__slots__}
-            values.update(sigmas_after=float(sigmas[k]), accepted=bool(kept[k]), reason=reason)
-            self.records[row] = LoopRecord(**values)
+            self.records[row] = dataclasses.replace(
+                old, sigmas_after=float(sigmas[k]), accepted=bool(kept[k]), reason=reason
+            )
         self.rows_in_graph = [row for k, row in enumerate(self.rows_in_graph) if kept[k]]

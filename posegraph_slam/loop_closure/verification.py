@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtrc, chdtri
 
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
-from posegraph_slam.geometry import SE2, Group
+from posegraph_slam.geometry import SE2, SE3
 from posegraph_slam.loop_closure.matching import Evidence
 from posegraph_slam.loop_closure.proposals import Candidates
 from posegraph_slam.loop_closure.settings import VerificationSettings
@@ -65,7 +65,7 @@ def count_support(
     """Count for each candidate (M,) the eligible ones nearby that agree, and those that disagree, with it.
 
     Two closures and the estimated paths between their ends form a loop, which closes when both are right (pairwise
-    consistency, Mangelson et al. 2018). `poses` (K, 3, 3) in the same frame as the closures, `path_m` (K,).
+    consistency, Mangelson et al. 2018). `poses` (K, d+1, d+1) in the same frame as the closures, `path_m` (K,).
     """
     agree, disagree = np.zeros(len(candidates), dtype=np.int64), np.zeros(len(candidates), dtype=np.int64)
     rows = np.flatnonzero(eligible)
@@ -77,7 +77,7 @@ def count_support(
     # neighbours that share an end, or nearly, see the same surfaces: they err together and prove nothing
     apart = np.abs(path_m[candidates.source[a]] - path_m[candidates.source[b]]) > 0.5
     a, b = a[apart], b[apart]
-    group: Group = SE2
+    group = SE2 if poses.shape[-1] == 3 else SE3
     across_a = group.between(poses[candidates.target[a]], poses[candidates.target[b]])
     back_b = group.between(poses[candidates.source[b]], poses[candidates.source[a]])
     around = group.inverse(T_target_source[a]) @ across_a @ T_target_source[b] @ back_b
@@ -85,9 +85,9 @@ def count_support(
     length = np.abs(path_m[candidates.target[a]] - path_m[candidates.target[b]]) + np.abs(
         path_m[candidates.source[a]] - path_m[candidates.source[b]]
     )
-    closes = (np.hypot(error[:, 0], error[:, 1]) < settings.consistency_m * (1 + 0.1 * length)) & (
-        np.abs(error[:, 2]) < settings.consistency_rad
-    )
+    shift = np.linalg.norm(group.translation_part(error), axis=1)
+    turn = np.linalg.norm(group.rotation_part(error), axis=1)
+    closes = (shift < settings.consistency_m * (1 + 0.1 * length)) & (turn < settings.consistency_rad)
     np.add.at(agree, np.concatenate([a[closes], b[closes]]), 1)
     np.add.at(disagree, np.concatenate([a[~closes], b[~closes]]), 1)
     return agree, disagree

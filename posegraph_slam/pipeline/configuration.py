@@ -22,6 +22,7 @@ from posegraph_slam.mapping.texture import TextureSettings
 from posegraph_slam.odometry.scan_matching import ScanMatchingSettings
 from posegraph_slam.odometry.settings import OdometrySettings
 from posegraph_slam.odometry.timing import TimingSettings
+from posegraph_slam.pipeline.rgbd_settings import RgbdSettings
 from posegraph_slam.pipeline.settings_files import Layer, build_settings, parse_override, read_layer
 from posegraph_slam.pipeline.spatial import SpatialSettings
 from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings
@@ -60,6 +61,7 @@ class Configuration(Settings):
     mapping: OccupancySettings = OccupancySettings()
     texture: TextureSettings = TextureSettings()
     floor: FloorSettings = FloorSettings()
+    rgbd: RgbdSettings = RgbdSettings()
     localization: LocalizationSettings = LocalizationSettings()
     particle_slam: ParticleSlamSettings = ParticleSlamSettings()
 

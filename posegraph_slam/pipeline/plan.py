@@ -5,7 +5,7 @@ from __future__ import annotations
 from posegraph_slam.odometry import chosen_source
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.depth_maps import floor_step
-from posegraph_slam.sensors import RobotLog
+from posegraph_slam.sensors import RgbdSequence, RobotLog
 
 SOURCES = {
     "logged": "take the odometry that the robot logged",
@@ -21,6 +21,8 @@ def describe(log: RobotLog, configuration: Configuration) -> list[str]:
     A log that cannot be optimised gives one phrase that says why.
     """
     scans = log.scans
+    if scans is None and log.rgbd_sequence is not None:
+        return _rgbd_steps(log, log.rgbd_sequence, configuration)
     if scans is None or len(scans) == 0:
         return ["refuse the log: it has no laser scans, and scan matching needs them"]
     steps = [
@@ -48,3 +50,16 @@ def _occupancy_step(configuration: Configuration) -> str:
     mapping = configuration.mapping
     size = f"of {mapping.fixed_size_m:g} x {mapping.fixed_size_m:g} m" if mapping.fixed_size_m else "that fits the log"
     return f"build an occupancy map {size} with cells of {mapping.resolution_m:g} m"
+
+
+def _rgbd_steps(log: RobotLog, sequence: RgbdSequence, configuration: Configuration) -> list[str]:
+    """Steps for the images of an RGB-D camera."""
+    size = f"{sequence.camera.width} x {sequence.camera.height}"
+    cloud = configuration.rgbd.cloud
+    compared = f"against {len(log.truth)} true poses" if log.truth is not None else "by the thickness of surfaces"
+    return [
+        f"align {len(sequence)} pairs of colour and depth images ({size}) by intensity and by distance to planes",
+        "choose keyframes, propose loop closures by overlap and by appearance, verify each, and solve the pose graph",
+        f"fuse the frames up to {cloud.max_depth_m:g} m into a coloured cloud with voxels of {cloud.voxel_m:g} m",
+        f"compare odometry and the optimised trajectory {compared}",
+    ]

@@ -13,16 +13,15 @@ from posegraph_slam.pipeline.configuration import Configuration, usable_workers
 from posegraph_slam.pipeline.editing import check_log, close_with_edits, planar
 from posegraph_slam.pipeline.edits import Edits, edits_digest, to_text
 from posegraph_slam.pipeline.executors import open_executor
+from posegraph_slam.pipeline.jobs import JobResult, optimize_log, save_job
 from posegraph_slam.pipeline.matching_file import MATCHING, read_matching
-from posegraph_slam.pipeline.optimize import OptimizationResult, optimize
 from posegraph_slam.pipeline.recording import Report, RunSummary, recorded_run
 from posegraph_slam.pipeline.run_directory import APPLIED_EDITS, RunDirectory, read_run_directory
-from posegraph_slam.pipeline.saving import save_run
 from posegraph_slam.pipeline.stored_graph import read_stored_graph
 
 __all__ = ["Draw", "RunSummary", "run"]
 
-Draw = Callable[[OptimizationResult, RunDirectory], None]
+Draw = Callable[[JobResult, RunDirectory], None]
 """Adds pictures to a run directory; given by the caller, since drawing lies above the pipeline."""
 
 
@@ -75,10 +74,12 @@ def run(
                     under_way.inputs["edits"] = {"run": str(matching_of.resolve()), "sha256": edits_digest(edits)}
                     under_way.directory.write_text(APPLIED_EDITS, to_text(edits))
         with open_executor(usable_workers(configuration)) as executor:
-            result = optimize(log, configuration, matched=matched, close=close, progress=progress, executor=executor)
+            result = optimize_log(
+                log, configuration, matched=matched, close=close, progress=progress, executor=executor
+            )
         clock.seconds.update(result.stages_s)
         with clock.stage("saving"):
-            save_run(result, under_way.directory)
+            save_job(result, under_way.directory)
         if draw is not None:
             with clock.stage("figures"):
                 draw(result, under_way.directory)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 
+from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.datasets.tum import write_tum
 from posegraph_slam.loop_closure.ledger import LoopRecord
 from posegraph_slam.mapping.archive import write_occupancy
@@ -32,19 +34,34 @@ def save_run(result: OptimizationResult, directory: RunDirectory) -> None:
 
 
 def save_loops(result: OptimizationResult, directory: RunDirectory) -> None:
-    """Write every loop candidate, named by keyframe, scan and stamp, with its evidence and what became of it."""
-    names = [field.name for field in fields(LoopRecord)]
-    stamps = result.trajectory.stamps_s[result.keyframes]
-    header = ["target_scan", "source_scan", "target_stamp_s", "source_stamp_s", *names]
+    """Write every loop candidate of a run with laser scans."""
+    write_loops(result.loops, result.keyframes, result.trajectory.stamps_s[result.keyframes], directory)
+
+
+def write_loops(
+    loops: Sequence[LoopRecord],
+    keyframes: IntArray,
+    stamps_s: FloatArray,
+    directory: RunDirectory,
+    *,
+    record: type[LoopRecord] = LoopRecord,
+    unit: str = "scan",
+) -> None:
+    """Write every loop candidate, named by keyframe, `unit` and stamp, with its evidence and what became of it.
+
+    `keyframes` (K,) are numbers of scans or frames, taken at `stamps_s` (K,); the columns are the fields of `record`.
+    """
+    names = [field.name for field in fields(record)]
+    header = [f"target_{unit}", f"source_{unit}", "target_stamp_s", "source_stamp_s", *names]
     rows = (
         [
-            result.keyframes[record.target],
-            result.keyframes[record.source],
-            stamps[record.target],
-            stamps[record.source],
-            *(getattr(record, name) for name in names),
+            keyframes[loop.target],
+            keyframes[loop.source],
+            stamps_s[loop.target],
+            stamps_s[loop.source],
+            *(getattr(loop, name) for name in names),
         ]
-        for record in result.loops
+        for loop in loops
     )
     directory.write_rows(LOOPS, header, rows)
 

@@ -3,6 +3,7 @@
 from posegraph_slam.sensors.imu import STANDARD_GRAVITY, Imu
 from posegraph_slam.sensors.laser import LaserScans
 from posegraph_slam.sensors.rgbd import DisparityCalibration, RgbdFrames
+from posegraph_slam.sensors.rgbd_sequence import PinholeCamera, RgbdSequence
 from posegraph_slam.sensors.robot_log import RobotLog
 from posegraph_slam.sensors.wheels import WheelEncoders
 
@@ -11,7 +12,9 @@ __all__ = [
     "DisparityCalibration",
     "Imu",
     "LaserScans",
+    "PinholeCamera",
     "RgbdFrames",
+    "RgbdSequence",
     "RobotLog",
     "WheelEncoders",
 ]

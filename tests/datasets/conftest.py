@@ -11,6 +11,12 @@ import numpy as np
 import pytest
 
 from posegraph_slam.datasets.simulation.humanoid import write_humanoid_log
+from posegraph_slam.datasets.simulation.rgbd_room import (
+    furnished_room,
+    loop_through_room,
+    small_camera,
+    write_rgbd_log,
+)
 
 from .bag_writing import maker_of, robot, store_as
 
@@ -127,6 +133,11 @@ def write_euroc(folder: Path, samples: int = 50) -> Path:
     return folder
 
 
+def write_rgbd(folder: Path, frames: int = 4) -> Path:
+    """Write a folder of small colour and depth images with intrinsics and true poses."""
+    return write_rgbd_log(folder, furnished_room(), small_camera(40, 30), loop_through_room(frames))
+
+
 def build(name: str, folder: Path) -> Path:
     """Write a small log of the format called `name`."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -137,6 +148,7 @@ def build(name: str, folder: Path) -> Path:
         "rosbag": lambda: store_as("ros1", folder, robot(maker_of("ros1"))),
         "euroc": lambda: write_euroc(folder / "sequence"),
         "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
+        "rgbd": lambda: write_rgbd(folder / "sequence"),
     }[name]()
 
 
@@ -150,10 +162,11 @@ def build_truncated(name: str, folder: Path) -> tuple[Path, Path]:
         "rosbag": lambda: store_as("ros1", folder, robot(maker_of("ros1"))),
         "euroc": lambda: write_euroc(folder / "sequence"),
         "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
+        "rgbd": lambda: write_rgbd(folder / "sequence"),
     }[name]()
     file = path
     if path.is_dir():
-        file = path / ("mav0/imu0/data.csv" if name == "euroc" else "Hokuyo7.npz")
+        file = path / {"euroc": "mav0/imu0/data.csv", "rgbd": "depth/00002.png"}.get(name, "Hokuyo7.npz")
     file.write_bytes(file.read_bytes()[:-100])
     return path, file
 
@@ -166,6 +179,11 @@ def ece276a_log() -> Callable[..., Path]:
 @pytest.fixture
 def carmen_lines() -> dict[str, Callable[..., Any]]:
     return {"flaser": flaser, "robotlaser": robotlaser, "odom": odom, "write": write_lines}
+
+
+@pytest.fixture
+def rgbd_log() -> Callable[..., Path]:
+    return write_rgbd
 
 
 @pytest.fixture

@@ -17,7 +17,8 @@ from posegraph_slam.errors import InputError
 from posegraph_slam.sensors import RobotLog
 
 every_reader = pytest.mark.parametrize("reader", BUILT_IN, ids=lambda reader: reader.name)
-WITHOUT_SCANS = {"imu_vicon", "euroc"}
+WITHOUT_SCANS = {"imu_vicon": "imu", "euroc": "imu", "rgbd": "images"}
+"""Formats without a laser, and the stream that they are about."""
 Builder = Callable[[str, Path], Path]
 
 
@@ -37,7 +38,8 @@ def test_reads_a_log_and_names_format_and_path(reader: Reader, tmp_path: Path, l
     log = datasets.read(path)
     assert isinstance(log, RobotLog)
     assert (log.format, log.path) == (reader.name, path)
-    main_stream = log.imu if reader.name in WITHOUT_SCANS else log.scans
+    streams = {"imu": log.imu, "images": log.rgbd_sequence}
+    main_stream = streams[WITHOUT_SCANS[reader.name]] if reader.name in WITHOUT_SCANS else log.scans
     assert main_stream is not None
     assert len(main_stream) > 1
     assert datasets.read(str(path), format=reader.name).format == reader.name
@@ -103,7 +105,7 @@ def test_a_truncated_file_is_named(
 def test_its_log_can_be_inspected(reader: Reader, tmp_path: Path, log_builder: Builder) -> None:
     report = inspect(datasets.read(log_builder(reader.name, tmp_path)))
     if reader.name in WITHOUT_SCANS:
-        assert report.streams[0].name == "imu"
+        assert report.streams[0].name == WITHOUT_SCANS[reader.name]
         return
     assert report.streams[0].name == "scans"
     assert report.path_length_m is not None

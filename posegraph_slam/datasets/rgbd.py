@@ -1,0 +1,205 @@
+"""Folders of colour and depth images: the TUM RGB-D benchmark's and Open3D's layouts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.datasets.image_headers import ImageHeader, read_image_header
+from posegraph_slam.datasets.number_text import read_table
+from posegraph_slam.datasets.rgbd_camera import (
+    DEPTH_UNITS_PER_M,
+    TUM_DEPTH_UNITS_PER_M,
+    default_camera,
+    find_camera_file,
+    read_camera,
+)
+from posegraph_slam.datasets.tum import read_tum
+from posegraph_slam.errors import InputError
+from posegraph_slam.geometry import Trajectory, pose_from_rotation_translation
+from posegraph_slam.sensors import RgbdSequence, RobotLog
+
+COLOUR_FOLDERS, DEPTH_FOLDERS = ("rgb", "color", "colour", "image", "images"), ("depth", "depths")
+COLOUR_SUFFIXES, DEPTH_SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm"), (".png", ".pgm")
+TRUTH_FILES = ("groundtruth.txt", "truth.tum", "pose.txt", "poses.txt", "trajectory.txt", "traj.txt")
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+TUM_GAP_S = 0.02
+"""Colour and depth frames further apart in time are not paired; the benchmark's own tool takes the same."""
+ASSUMED_RATE_HZ = 30.0
+
+_Pairs = tuple[list[Path], list[Path], FloatArray]
+
+
+def detects(path: Path) -> bool:
+    """Whether `path` is a folder with lists of colour and depth files, or with a folder of each."""
+    if not path.is_dir():
+        return False
+    if (path / "rgb.txt").is_file() and (path / "depth.txt").is_file():
+        return True
+    return _subfolder(path, COLOUR_FOLDERS) is not None and _subfolder(path, DEPTH_FOLDERS) is not None
+
+
+def read(path: Path) -> RobotLog:
+    """Read a folder of registered colour and depth images; the images themselves stay on disk.
+
+    The camera is the body. Raises InputError for frames without partner, images of unequal size, depth that is not of
+    16 bits, and files that cannot be read.
+    """
+    remarks: list[str] = []
+    tum = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+    colour, depth, stamps = _listed_pairs(path, remarks) if tum else _numbered_pairs(path, remarks)
+    header = _checked_headers(colour, depth)
+    file = find_camera_file(path)
+    if file is None:
+        camera, remark = default_camera(path, header.width, header.height, tum=tum)
+        remarks.append(remark)
+    else:
+        units = TUM_DEPTH_UNITS_PER_M if tum else DEPTH_UNITS_PER_M
+        camera, more = read_camera(file, header.width, header.height, units)
+        remarks += [f"intrinsics from {file.name}: {camera.describe()}", *more]
+    sequence = RgbdSequence(stamps_s=stamps, colour_files=tuple(colour), depth_files=tuple(depth), camera=camera)
+    truth = _truth(path, stamps)
+    return RobotLog(path=path, format="rgbd", rgbd_sequence=sequence, truth=truth, remarks=tuple(remarks))
+
+
+def _subfolder(path: Path, names: tuple[str, ...]) -> Path | None:
+    """The subfolder with the first of the customary names, in any case."""
+    by_name = {entry.name.lower(): entry for entry in sorted(path.iterdir()) if entry.is_dir()}
+    return next((by_name[name] for name in names if name in by_name), None)
+
+
+def _listed_pairs(path: Path, remarks: list[str]) -> _Pairs:
+    """Pair the frames of rgb.txt and depth.txt (a stamp and a file a line), nearest in time, each used once."""
+    colour_s, colour = _read_list(path / "rgb.txt")
+    depth_s, depth = _read_list(path / "depth.txt")
+    order = np.argsort(depth_s, kind="stable")
+    after = np.clip(np.searchsorted(depth_s[order], colour_s), 1, max(len(depth_s) - 1, 1))
+    before, after = order[after - 1], order[np.minimum(after, len(depth_s) - 1)]
+    nearest = np.where(np.abs(colour_s - depth_s[before]) <= np.abs(depth_s[after] - colour_s), before, after)
+    gap = np.abs(colour_s - depth_s[nearest])
+    chosen = dict[int, int]()
+    for c in np.lexsort((np.arange(len(gap)), gap)):  # closest pairs first, so that none loses its partner to a worse
+        if gap[c] <= TUM_GAP_S and int(nearest[c]) not in chosen:
+            chosen[int(nearest[c])] = int(c)
+    pairs = sorted((c, d) for d, c in chosen.items())
+    if not pairs:
+        raise InputError(path, f"no colour and depth frames lie within {TUM_GAP_S:g} s", "check rgb.txt and depth.txt")
+    left = len(colour) - len(pairs)
+    if left:
+        remarks.append(f"{left} of {len(colour)} colour frames have no depth frame within {TUM_GAP_S:g} s: left out")
+    stamps = np.array([colour_s[c] for c, _ in pairs])
+    return [colour[c] for c, _ in pairs], [depth[d] for _, d in pairs], stamps
+
+
+def _read_list(file: Path) -> tuple[FloatArray, list[Path]]:
+    stamps, paths = list[float](), list[Path]()
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamp = float(words[0])
+            name = words[1]
+        except (ValueError, IndexError):
+            raise InputError(f"{file}:{number}", "is not a stamp and a file name", "correct the line") from None
+        frame = file.parent / name
+        if not frame.is_file():
+            raise InputError(f"{file}:{number}", f"names {name}, which is missing", "copy the file, or remove the line")
+        stamps.append(stamp)
+        paths.append(frame)
+    if not stamps:
+        raise InputError(file, "lists no frame", "give a stamp and a file name a line")
+    return np.array(stamps), paths
+
+
+def _numbered_pairs(path: Path, remarks: list[str]) -> _Pairs:
+    """Pair the files of two folders by the number in their names, or by order where the numbers are unrelated."""
+    colour_folder, depth_folder = _subfolder(path, COLOUR_FOLDERS), _subfolder(path, DEPTH_FOLDERS)
+    if colour_folder is None or depth_folder is None:
+        raise InputError(
+            path, "has no folders of colour and depth images", f"name them {COLOUR_FOLDERS[1]} and {DEPTH_FOLDERS[0]}"
+        )
+    colour, depth = _images(colour_folder, COLOUR_SUFFIXES), _images(depth_folder, DEPTH_SUFFIXES)
+    only_colour, only_depth = sorted(set(colour) - set(depth)), sorted(set(depth) - set(colour))
+    if only_colour or only_depth:
+        if len(colour) != len(depth) or set(colour) & set(depth):
+            lonely = colour[only_colour[0]] if only_colour else depth[only_depth[0]]
+            missing = "depth" if only_colour else "colour"
+            raise InputError(
+                lonely,
+                f"has no {missing} frame of the same number ({len(colour)} colour and {len(depth)} depth frames)",
+                "add the missing frame, or remove this one",
+            )
+        remarks.append("colour and depth frames are numbered differently: they are paired in order")
+    a, b = [colour[key] for key in sorted(colour)], [depth[key] for key in sorted(depth)]
+    stamps = _stamps_of_names(a)
+    if stamps is None:
+        stamps = np.arange(len(a)) / ASSUMED_RATE_HZ
+        remarks.append(f"the frames have no stamps: {ASSUMED_RATE_HZ:g} frames a second are assumed")
+    return a, b, stamps
+
+
+def _images(folder: Path, suffixes: tuple[str, ...]) -> dict[tuple[float, str], Path]:
+    """Image files of a folder by the first number in their name; where numbers repeat, by name too."""
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
+    if not files:
+        raise InputError(folder, f"holds no image ({', '.join(suffixes)})", "check the folder")
+    numbers = [_number_in(file.stem) for file in files]
+    if len(set(numbers)) == len(files):
+        return {(number, ""): file for number, file in zip(numbers, files, strict=True)}
+    return {(number, file.stem): file for number, file in zip(numbers, files, strict=True)}
+
+
+def _number_in(name: str) -> float:
+    found = re.search(r"\d+(?:\.\d+)?", name)
+    return float(found[0]) if found else -1.0
+
+
+def _stamps_of_names(files: list[Path]) -> FloatArray | None:
+    """Stamps (N,) where every name is a number of seconds with decimals."""
+    if not all(re.fullmatch(r"\d+\.\d+", file.stem) for file in files):
+        return None
+    return np.array([float(file.stem) for file in files])
+
+
+def _checked_headers(colour: list[Path], depth: list[Path]) -> ImageHeader:
+    """The header of the first colour image, after all have been compared with it and each depth found usable."""
+    first = read_image_header(colour[0])
+    for file in colour:
+        header = read_image_header(file)
+        if (header.width, header.height) != (first.width, first.height):
+            raise InputError(file, f"is {header}, but {colour[0].name} is {first}", "all images must have one size")
+        if header.bits != 8:
+            raise InputError(file, f"is {header}", "give colour images of 8 bits")
+    for file in depth:
+        header = read_image_header(file)
+        if header.bits != 16 or header.channels != 1:
+            raise InputError(file, f"is {header}, not 16-bit grey", "store depth as 16-bit PNG or PGM")
+        if (header.width, header.height) != (first.width, first.height):
+            raise InputError(
+                file, f"is {header.width} x {header.height}, but the colour images are {first.width} x {first.height}",
+                "register the depth to the colour images",
+            )  # fmt: skip
+    return first
+
+
+def _truth(path: Path, stamps: FloatArray) -> Trajectory | None:
+    """True camera poses: a TUM file, or x y z qx qy qz qw a line for every frame."""
+    file = next((path / name for name in TRUTH_FILES if (path / name).is_file()), None)
+    if file is None:
+        return None
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        width = next((len(line.split()) for line in lines if line.strip() and not line.startswith("#")), 0)
+    if width != len(POSE_COLUMNS):
+        return read_tum(file, parent="ref", child="camera")
+    values, _ = read_table(file, POSE_COLUMNS)
+    if len(values) != len(stamps):
+        raise InputError(file, f"holds {len(values)} poses for {len(stamps)} frames", "give one a frame")
+    R = Rotation.from_quat(values[:, 3:]).as_matrix()
+    return Trajectory(
+        stamps_s=stamps, poses=pose_from_rotation_translation(R, values[:, :3]), parent="ref", child="camera"
+    )

@@ -1,0 +1,287 @@
+"""The job of an RGB-D log: odometry, loop closure, fused cloud, and the comparison of before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.errors import InputError
+from posegraph_slam.evaluation.ape import absolute_pose_error
+from posegraph_slam.evaluation.summary import compare, evaluate_trajectory
+from posegraph_slam.evaluation.tables import ComparisonRow, ComparisonTable
+from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
+from posegraph_slam.geometry import SE3, Trajectory, deform
+from posegraph_slam.loop_closure.closing import LoopClosureResult
+from posegraph_slam.loop_closure.ledger import LoopRecord
+from posegraph_slam.loop_closure.rgbd_closing import close_rgbd_loops
+from posegraph_slam.loop_closure.rgbd_views import KeyframeViews
+from posegraph_slam.mapping.colour_cloud import ColourCloud, ColourCloudSettings, fuse_cloud
+from posegraph_slam.mapping.surface_thickness import SurfaceCells, surface_cells, upward_direction
+from posegraph_slam.odometry.rgbd_odometry import RgbdOdometry, track_rgbd
+from posegraph_slam.pipeline.clock import StageClock
+from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.rgbd_frames import FrameImages, PreparedFrames, chosen_camera
+from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
+from posegraph_slam.pose_graph.solve import solve
+from posegraph_slam.registration.rgbd_alignment import align_frames
+from posegraph_slam.sensors import RgbdSequence, RobotLog
+
+SAMPLED_KEYFRAMES = 150
+"""The thickness of surfaces is measured on so many keyframes at most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RgbdResult:
+    """Everything that a run of an RGB-D log found.
+
+    `stages` maps odometry and optimised to the camera's trajectory (all frames); `graph` has the keyframes as nodes;
+    `loops` records every candidate. `cloud` is None where maps were not asked for. `upward` (3,) is the direction
+    against gravity in the map frame, as far as floors and tables tell.
+    """
+
+    stages: Mapping[str, Trajectory]
+    odometry: RgbdOdometry
+    graph: PoseGraph
+    loops: tuple[LoopRecord, ...]
+    cloud: ColourCloud | None
+    samples: Mapping[str, FloatArray]
+    """Points (n, 3) of some keyframes, placed by each stage: what the thickness was measured on."""
+    upward: FloatArray
+    comparison: ComparisonTable
+    metrics: Mapping[str, Any]
+    stages_s: Mapping[str, float]
+    truth: Trajectory | None
+    remarks: tuple[str, ...]
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The optimised trajectory, map -> camera, a pose for every frame."""
+        return self.stages["optimised"]
+
+    @property
+    def keyframes(self) -> IntArray:
+        """Frames (K,) that are nodes of the graph."""
+        return self.odometry.keyframes
+
+    @property
+    def rejected_pairs(self) -> IntArray:
+        """Target and source keyframe (R, 2) of the candidates that were rejected."""
+        pairs = [(record.target, record.source) for record in self.loops if not record.accepted]
+        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def optimize_rgbd(
+    log: RobotLog,
+    configuration: Configuration,
+    *,
+    progress: Progress = silent_progress,
+    executor: Executor | None = None,
+) -> RgbdResult:
+    """Track the camera, close loops, fuse the frames and compare odometry with the optimised trajectory.
+
+    The result depends on the log and the configuration alone, not on the number of workers. Raises InputError for a
+    log without RGB-D images, or whose frames cannot be aligned.
+    """
+    if log.rgbd_sequence is None:
+        raise InputError(log.path, "has no RGB-D images", "give a folder of colour and depth images")
+    executor, clock, settings = executor or SerialExecutor(), StageClock(), configuration.rgbd
+    camera, remarks = chosen_camera(log.rgbd_sequence.camera, settings.camera)
+    sequence = RgbdSequence(
+        stamps_s=log.rgbd_sequence.stamps_s,
+        colour_files=log.rgbd_sequence.colour_files,
+        depth_files=log.rgbd_sequence.depth_files,
+        camera=camera,
+    )
+    images = FrameImages(sequence=sequence)
+    frames = PreparedFrames(images=images, max_depth_m=settings.max_depth_m)
+    with clock.stage("odometry"):
+        tracked = track_rgbd(
+            frames, sequence.stamps_s, settings.odometry, seed=configuration.seed, executor=executor, progress=progress
+        )
+    with clock.stage("loop closure"):
+        views = KeyframeViews(frames, tracked.keyframes, executor)
+        closed = _close(tracked, views, configuration, executor, progress)
+        optimised = deform(tracked.trajectory, tracked.keyframes, closed.graph.poses)
+    stages = {"odometry": tracked.trajectory, "optimised": optimised.with_poses(optimised.poses, parent="map")}
+    cloud = None
+    if configuration.maps:
+        with clock.stage("fusing"):
+            cloud = fuse_cloud(
+                images, stages["optimised"].poses, camera.vector(), settings.cloud,
+                depth_units_per_m=camera.depth_units_per_m, executor=executor, progress=progress,
+            )  # fmt: skip
+    with clock.stage("evaluation"):
+        samples, cells = _samples(stages, tracked.keyframes, views, settings.cloud.max_depth_m)
+        gaps = _first_to_last(stages, tracked.keyframes, views, configuration)
+        table, metrics = _compared(stages, log.truth, cells, gaps)
+        upward = upward_direction(cells["optimised"], -stages["optimised"].poses[:, :3, 1].mean(axis=0))
+    return RgbdResult(
+        stages=stages,
+        odometry=tracked,
+        graph=closed.graph,
+        loops=closed.records,
+        cloud=cloud,
+        samples=samples,
+        upward=upward,
+        comparison=table,
+        metrics={**metrics, **_summary(tracked, closed, cloud)},
+        stages_s=clock.seconds,
+        truth=log.truth,
+        remarks=(
+            *_without_replaced(log.remarks, bool(remarks)),
+            *remarks,
+            *tracked.remarks,
+            *_warnings(closed, cloud, settings.cloud),
+        ),
+    )
+
+
+def keyframe_chain(tracked: RgbdOdometry) -> PoseGraph:
+    """Return the graph of the keyframes, each tied to the one before by its alignment; the first is fixed."""
+    poses = tracked.trajectory.poses[tracked.keyframes]
+    count = len(poses)
+    return PoseGraph(
+        poses=poses,
+        session=np.zeros(count, dtype=np.int64),
+        index=tracked.keyframes,
+        fixed=np.arange(count) == 0,
+        constraints=Constraints(
+            i=np.arange(count - 1),
+            j=np.arange(1, count),
+            T_i_j=tracked.T_i_j,
+            information=tracked.information,
+            kind=np.where(tracked.guessed, int(ConstraintKind.ODOMETRY), int(ConstraintKind.SCAN_MATCHING)),
+        ),
+    )
+
+
+def _close(
+    tracked: RgbdOdometry, views: KeyframeViews, configuration: Configuration, executor: Executor, progress: Progress
+) -> LoopClosureResult:
+    chain = keyframe_chain(tracked)
+    if not configuration.loop_closure.enabled:
+        return LoopClosureResult(graph=chain, records=(), rounds=0, solution=solve(chain, configuration.pose_graph))
+    return close_rgbd_loops(
+        chain,
+        views,
+        configuration.rgbd.loops,
+        configuration.pose_graph,
+        seed=configuration.seed,
+        executor=executor,
+        progress=progress,
+    )
+
+
+def _samples(
+    stages: Mapping[str, Trajectory], keyframes: IntArray, views: KeyframeViews, max_depth_m: float
+) -> tuple[dict[str, FloatArray], dict[str, SurfaceCells]]:
+    """Points of some keyframes in the frame of each stage, and the surfaces that they make there."""
+    count = len(keyframes)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, SAMPLED_KEYFRAMES)).astype(np.int64)).tolist()
+    points = []
+    for k in chosen:
+        reference = views.reference(k)
+        p = reference.points[0].points
+        points.append(p[p[:, 2] <= max_depth_m])
+    frame = np.repeat(chosen, [len(part) for part in points])
+    placed, cells = {}, {}
+    for name, trajectory in stages.items():
+        T = trajectory.poses[keyframes[chosen]]
+        placed[name] = np.concatenate([p @ t[:3, :3].T + t[:3, 3] for p, t in zip(points, T, strict=True)])
+        cells[name] = surface_cells(placed[name], frame)
+    return placed, cells
+
+
+def _first_to_last(
+    stages: Mapping[str, Trajectory], keyframes: IntArray, views: KeyframeViews, configuration: Configuration
+) -> dict[str, FloatArray] | None:
+    """Tangent (6,) by which each stage misses the direct alignment of the last keyframe to the first, if they overlap.
+
+    The alignment starts from the optimised trajectory; None where it is not usable.
+    """
+    if len(keyframes) < 3:
+        return None
+    first, last = int(keyframes[0]), int(keyframes[-1])
+    across = {name: SE3.between(t.poses[first], t.poses[last]) for name, t in stages.items()}
+    found = align_frames(
+        views.reference(0), views.reference(len(keyframes) - 1), across["optimised"], configuration.rgbd.loops.alignment
+    )
+    if not found.usable:
+        return None
+    return {name: SE3.local(T, found.T_target_source) for name, T in across.items()}
+
+
+def _compared(
+    stages: Mapping[str, Trajectory],
+    truth: Trajectory | None,
+    cells: Mapping[str, SurfaceCells],
+    gaps: Mapping[str, FloatArray] | None,
+) -> tuple[ComparisonTable, dict[str, Any]]:
+    """The table of the stages, and their metrics: errors where the truth is known, and what the images say alone."""
+    measured = {name: evaluate_trajectory(t, truth=truth) for name, t in stages.items()}
+    rows, more = list[ComparisonRow](), dict[str, dict[str, float | None]]()
+
+    def add(name: str, unit: str, decimals: int, values: list[float]) -> None:
+        rows.append(ComparisonRow(name=name, unit=unit, decimals=decimals, values=tuple(values)))
+        more[name] = dict(zip(stages, values, strict=True))
+
+    if truth is not None:
+        from_start = [absolute_pose_error(t, truth, alignment="origin") for t in stages.values()]
+        add("position from the first frame max", "m", 4, [e.translation_m.max for e in from_start])
+        add("rotation from the first frame max", "deg", 3, [e.rotation_deg.max for e in from_start])
+    if gaps is not None:
+        add("first to last frame, position off", "m", 4, [float(np.linalg.norm(gaps[name][3:])) for name in stages])
+        add("first to last frame, rotation off", "deg", 3,
+            [float(np.rad2deg(np.linalg.norm(gaps[name][:3]))) for name in stages])  # fmt: skip
+    if all(len(cells[name].thickness_m) for name in stages):
+        add("thickness of surfaces, median", "m", 5, [cells[name].median_m for name in stages])
+    table = compare(measured)
+    table = ComparisonTable(stages=table.stages, rows=(*table.rows, *rows))
+    return table, {"stages": {name: m.as_dict() for name, m in measured.items()}, "images": more}
+
+
+def _summary(tracked: RgbdOdometry, closed: LoopClosureResult, cloud: ColourCloud | None) -> dict[str, Any]:
+    """Counts of the run for `metrics.json`."""
+    accepted = [record for record in closed.records if record.accepted]
+    return {
+        "frames": len(tracked.trajectory),
+        "frames_tracked": int(tracked.tracked.sum()),
+        "keyframes": len(tracked.keyframes),
+        "guessed_motions": int(tracked.guessed.sum()),
+        "loops_proposed": len(closed.records),
+        "loops_accepted": len(accepted),
+        "loops_by_kind": {
+            kind: {
+                "proposed": sum(record.kind == kind for record in closed.records),
+                "accepted": sum(record.kind == kind for record in accepted),
+            }
+            for kind in sorted({record.kind for record in closed.records})
+        },
+        "loop_rounds": closed.rounds,
+        "graph_cost_initial": closed.solution.cost_initial,
+        "graph_cost": closed.solution.cost,
+        "solver_stop_reason": str(closed.solution.stop_reason),
+        "cloud_points": len(cloud) if cloud is not None else 0,
+        "cloud_voxel_m": cloud.voxel_m if cloud is not None else None,
+    }
+
+
+def _without_replaced(remarks: tuple[str, ...], camera_given: bool) -> tuple[str, ...]:
+    """The reader's remarks, without that on the camera's numbers where the configuration gives others."""
+    return tuple(remark for remark in remarks if not (camera_given and "intrinsics" in remark))
+
+
+def _warnings(closed: LoopClosureResult, cloud: ColourCloud | None, settings: ColourCloudSettings) -> tuple[str, ...]:
+    """Plain sentences on what a user should look at."""
+    remarks = list(closed.solution.notes)
+    if not closed.solution.converged:
+        remarks.append(f"the pose graph did not converge: {closed.solution.stop_reason}")
+    if cloud is not None and cloud.voxel_m > settings.voxel_m:
+        remarks.append(
+            f"the cloud's voxels were widened to {cloud.voxel_m:g} m to bound memory (rgbd.cloud.voxels_max)"
+        )
+    return tuple(remarks)

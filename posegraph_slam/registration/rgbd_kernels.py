@@ -1,0 +1,319 @@
+"""Kernels of the direct alignment of RGB-D frames: residuals of a pose, and one Gauss-Newton step from them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from posegraph_slam.arrays import ByteArray, Float32Array, FloatArray
+from posegraph_slam.jit import kernel
+
+OUT, UNMEASURED, SEEN, OCCLUDED, INVADES = 0, 1, 2, 3, 4
+"""What becomes of a reference point in the source frame: not in view, in view without depth, seen on its surface,
+hidden behind something nearer, or in space that the source saw free."""
+MEDIAN_TO_SIGMA = 1.4826
+CAUCHY, CUT = 2.3849, 14.0
+"""Scale of the weights in deviations, and where a residual counts no more. On wide pairs Tukey's weights, which end at
+4.7, fall into wrong minima: features then miss by 3.3 px where they miss by 2.3 px with these."""
+
+
+class Side(NamedTuple):
+    """Points of one frame (see `ReferencePoints`) and the images of the other, [fx, fy, cx, cy] its camera."""
+
+    points: FloatArray
+    normals: FloatArray
+    gradients: FloatArray
+    intensity: FloatArray
+    sigma: FloatArray
+    image: Float32Array
+    depth: Float32Array
+    camera: FloatArray
+
+
+@kernel
+def warp(
+    side: Side, T: FloatArray, gate: float, across: FloatArray, brightness: FloatArray, moved: FloatArray,
+    state: ByteArray,
+) -> None:  # fmt: skip
+    """Compare reference points with the source frame at T = T_target_source.
+
+    Writes for every point its distance `across` (n,) of the source's surface from the plane of the reference, in
+    deviations of depth (NaN where unknown), the difference of `brightness` (n,) (NaN where unknown), the surface point
+    `moved` (n, 3) in the target frame, and its `state` (n,). Depths further apart than the larger of `gate` and six
+    deviations are no match.
+    """
+    points, normals, gradients, intensity, sigma = (
+        side.points, side.normals, side.gradients, side.intensity, side.sigma,
+    )  # fmt: skip
+    image, depth = side.image, side.depth
+    fx, fy, cx, cy = side.camera[0], side.camera[1], side.camera[2], side.camera[3]
+    height, width = image.shape
+    for k in range(len(points)):
+        across[k], brightness[k], state[k] = np.nan, np.nan, OUT
+        dx, dy, dz = points[k, 0] - T[0, 3], points[k, 1] - T[1, 3], points[k, 2] - T[2, 3]
+        x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
+        y = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
+        z = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
+        if z < 0.05:
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        if not (1.0 <= u < width - 2.0 and 1.0 <= v < height - 2.0):
+            continue
+        j, i = int(u), int(v)
+        a, b = u - j, v - i
+        state[k] = UNMEASURED
+        d00, d01, d10, d11 = depth[i, j], depth[i, j + 1], depth[i + 1, j], depth[i + 1, j + 1]
+        low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
+        allowed = max(gate, 6.0 * sigma[k])
+        has_depth = False
+        if low > 0.0:
+            if high - low < 0.03 * low + 0.5 * gate:
+                has_depth = True
+                measured = (1 - b) * ((1 - a) * d00 + a * d01) + b * ((1 - a) * d10 + a * d11)
+            else:  # the edge of an object: compare with its nearer side only to tell what is hidden
+                if z > high + allowed:
+                    state[k] = OCCLUDED
+                continue
+            if measured < z - allowed:
+                state[k] = OCCLUDED
+                continue
+            if measured > z + allowed:
+                state[k] = INVADES
+                continue
+        if has_depth:
+            state[k] = SEEN
+            sx, sy = (u - cx) / fx * measured, (v - cy) / fy * measured
+            for r in range(3):
+                moved[k, r] = T[r, 0] * sx + T[r, 1] * sy + T[r, 2] * measured + T[r, 3]
+            if normals[k, 2] != 0.0:
+                gap = 0.0
+                for r in range(3):
+                    gap += normals[k, r] * (moved[k, r] - points[k, r])
+                across[k] = gap / sigma[k]
+        if gradients[k, 0] != 0.0 or gradients[k, 1] != 0.0:
+            value = (1 - b) * ((1 - a) * image[i, j] + a * image[i, j + 1]) + b * (
+                (1 - a) * image[i + 1, j] + a * image[i + 1, j + 1]
+            )
+            brightness[k] = value - intensity[k]
+
+
+@kernel
+def middle_of(values: FloatArray, about: float, absolute: bool) -> float:
+    """Median of the numbers among `values` (n,) less `about`, or of their sizes; 0 where there is none."""
+    kept = np.empty(len(values))
+    count = 0
+    for k in range(len(values)):
+        if values[k] == values[k]:
+            kept[count] = abs(values[k] - about) if absolute else values[k] - about
+            count += 1
+    if count == 0:
+        return 0.0
+    return float(np.partition(kept[:count], count // 2)[count // 2])
+
+
+@kernel
+def normal_equations(
+    points: FloatArray, normals: FloatArray, gradients: FloatArray, across: FloatArray, brightness: FloatArray,
+    moved: FloatArray, sigma: FloatArray, scales: FloatArray, H: FloatArray, g: FloatArray,
+) -> float:  # fmt: skip
+    """Add up H (6, 6) and g (6,) for the update exp(e) T, both kinds of residuals under Cauchy's weights.
+
+    `scales` is [deviation of `across`, deviation of `brightness`, its offset]. Returns the weighted cost.
+    """
+    H[:], g[:] = 0.0, 0.0
+    row = np.zeros(6)
+    cost = 0.0
+    for k in range(len(points)):
+        if across[k] == across[k]:
+            e = across[k] / scales[0]
+            if abs(e) < CUT:
+                weight = 1.0 / (1.0 + (e / CAUCHY) ** 2)
+                factor = 1.0 / (sigma[k] * scales[0])
+                nx, ny, nz = normals[k, 0] * factor, normals[k, 1] * factor, normals[k, 2] * factor
+                row[0] = moved[k, 1] * nz - moved[k, 2] * ny
+                row[1] = moved[k, 2] * nx - moved[k, 0] * nz
+                row[2] = moved[k, 0] * ny - moved[k, 1] * nx
+                row[3], row[4], row[5] = nx, ny, nz
+                cost += weight * e * e
+                for a in range(6):
+                    g[a] += weight * e * row[a]
+                    for b in range(a + 1):
+                        H[a, b] += weight * row[a] * row[b]
+        if brightness[k] == brightness[k]:
+            e = (brightness[k] - scales[2]) / scales[1]
+            if abs(e) < CUT:
+                weight = 1.0 / (1.0 + (e / CAUCHY) ** 2)
+                factor = -1.0 / scales[1]
+                hx, hy, hz = gradients[k, 0] * factor, gradients[k, 1] * factor, gradients[k, 2] * factor
+                row[0] = points[k, 1] * hz - points[k, 2] * hy
+                row[1] = points[k, 2] * hx - points[k, 0] * hz
+                row[2] = points[k, 0] * hy - points[k, 1] * hx
+                row[3], row[4], row[5] = hx, hy, hz
+                cost += weight * e * e
+                for a in range(6):
+                    g[a] += weight * e * row[a]
+                    for b in range(a + 1):
+                        H[a, b] += weight * row[a] * row[b]
+    for a in range(6):
+        for b in range(a):
+            H[b, a] = H[a, b]
+    return cost
+
+
+@kernel
+def left_update(T: FloatArray, step: FloatArray) -> FloatArray:
+    """Return exp(step) T for a step (6,) [rotation, translation]."""
+    wx, wy, wz = step[0], step[1], step[2]
+    angle = np.sqrt(wx * wx + wy * wy + wz * wz)
+    if angle > 1e-4:
+        s, c, e = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    else:
+        s, c, e = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1.0 / 6 - angle**2 / 120
+    K = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
+    KK = K @ K
+    R, V = np.eye(3) + s * K + c * KK, np.eye(3) + c * K + e * KK
+    result = np.eye(4)
+    result[:3, :3] = R @ np.ascontiguousarray(T[:3, :3])
+    result[:3, 3] = R @ np.ascontiguousarray(T[:3, 3]) + V @ np.ascontiguousarray(step[3:])
+    return result
+
+
+@kernel
+def adjoint(T: FloatArray) -> FloatArray:
+    """Adjoint (6, 6) of a pose for tangents [rotation, translation]."""
+    A = np.zeros((6, 6))
+    x, y, z = T[0, 3], T[1, 3], T[2, 3]
+    for c in range(3):
+        for r in range(3):
+            A[r, c] = A[3 + r, 3 + c] = T[r, c]
+        A[3, c] = y * T[2, c] - z * T[1, c]
+        A[4, c] = z * T[0, c] - x * T[2, c]
+        A[5, c] = x * T[1, c] - y * T[0, c]
+    return A
+
+
+@kernel
+def inverse(T: FloatArray) -> FloatArray:
+    """Inverse of a pose (4, 4)."""
+    result = np.eye(4)
+    for r in range(3):
+        result[r, 3] = 0.0
+        for c in range(3):
+            result[r, c] = T[c, r]
+            result[r, 3] -= T[c, r] * T[c, 3]
+    return result
+
+
+@kernel
+def linearise(side: Side, T: FloatArray, gate: float, floors: FloatArray, H: FloatArray, g: FloatArray) -> None:
+    """Write H (6, 6) and g (6,) of one frame's points against the other frame, each kind of residual on its scale."""
+    n = len(side.points)
+    across, brightness, moved, state = np.empty(n), np.empty(n), np.zeros((n, 3)), np.zeros(n, np.uint8)
+    warp(side, T, gate, across, brightness, moved, state)
+    scales = residual_scales(across, brightness, floors)
+    normal_equations(side.points, side.normals, side.gradients, across, brightness, moved, side.sigma, scales, H, g)
+
+
+@kernel
+def residual_scales(across: FloatArray, brightness: FloatArray, floors: FloatArray) -> FloatArray:
+    """Robust deviation of `across`, that of `brightness`, and the offset of the latter: exposures differ."""
+    scales = np.empty(3)
+    scales[0] = max(MEDIAN_TO_SIGMA * middle_of(across, 0.0, True), floors[0])
+    scales[2] = middle_of(brightness, 0.0, False)
+    scales[1] = max(MEDIAN_TO_SIGMA * middle_of(brightness, scales[2], True), floors[1])
+    return scales
+
+
+@kernel
+def align_level(
+    side: Side, back: Side, T: FloatArray, gate: float, iterations: int, floors: FloatArray
+) -> tuple[FloatArray, int, bool]:
+    """Iterate Gauss-Newton on one level from T; stop when a step moves the view less than a fiftieth of a pixel.
+
+    `side` holds the target's points and the source's images, `back` the source's points, none of them to align in one
+    direction, and the target's images. `floors` are the least deviations [of depth in its own
+    deviations, of brightness]. Returns the pose, iterations made, and whether they settled.
+    """
+    H, g, H_back, g_back = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    distance = max(side.points[:, 2].mean(), 0.1)
+    fine = 0.02 / side.camera[0]
+    for made in range(iterations):
+        linearise(side, T, gate, floors, H, g)
+        if len(back.points) > 0:
+            T_back = inverse(T)
+            linearise(back, T_back, gate, floors, H_back, g_back)
+            # exp(e) T has the inverse T^-1 exp(-e) = exp(-Ad(T^-1) e) T^-1
+            A = -adjoint(T_back)
+            H += A.T @ H_back @ A
+            g += A.T @ g_back
+        for a in range(6):
+            H[a, a] += 1e-6 * H[a, a] + 1e-9
+        step = np.asarray(-np.linalg.solve(H, g))
+        if not np.isfinite(step).all():
+            return T, made, False
+        T = left_update(T, step)
+        turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+        shift = np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+        if turn < fine and shift < fine * distance:
+            return T, made + 1, True
+    return T, iterations, False
+
+
+@kernel
+def describe_fit(
+    side: Side, T: FloatArray, gate: float, floors: FloatArray, tiles: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return H (6, 6), the sum of outer products of the scores of image tiles (6, 6), and measures of the fit (10,).
+
+    Residuals of neighbouring pixels are far from independent; those of whole tiles nearly are. The measures count
+    points, then those in every state, from OUT to INVADES; then [points with a normal on a surface, those within three
+    deviations, sum of their squared distances in metres, correlation of the intensities].
+    """
+    points, normals, gradients, intensity, sigma = (
+        side.points, side.normals, side.gradients, side.intensity, side.sigma,
+    )  # fmt: skip
+    camera, image, n = side.camera, side.image, len(side.points)
+    across, brightness, moved, state = np.empty(n), np.empty(n), np.zeros((n, 3)), np.zeros(n, np.uint8)
+    warp(side, T, gate, across, brightness, moved, state)
+    scales = residual_scales(across, brightness, floors)
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    normal_equations(points, normals, gradients, across, brightness, moved, sigma, scales, H, g)
+    measures = np.zeros(10)
+    measures[0] = n
+    pairs, sum_a, sum_b, sum_aa, sum_bb, sum_ab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    tile = np.empty(n, np.int64)
+    for k in range(n):
+        u = camera[0] * points[k, 0] / points[k, 2] + camera[2]
+        v = camera[1] * points[k, 1] / points[k, 2] + camera[3]
+        column = min(max(int(u * tiles / image.shape[1]), 0), tiles - 1)
+        tile[k] = min(max(int(v * tiles / image.shape[0]), 0), tiles - 1) * tiles + column
+        measures[1 + state[k]] += 1
+        if across[k] == across[k]:
+            measures[6] += 1
+            if abs(across[k]) < 3.0 * scales[0]:
+                measures[7] += 1
+                measures[8] += (across[k] * sigma[k]) ** 2
+        if brightness[k] == brightness[k]:
+            a, b = intensity[k], intensity[k] + brightness[k]
+            pairs += 1
+            sum_a, sum_b = sum_a + a, sum_b + b
+            sum_aa, sum_bb, sum_ab = sum_aa + a * a, sum_bb + b * b, sum_ab + a * b
+    if pairs > 1:
+        spread = (sum_aa - sum_a * sum_a / pairs) * (sum_bb - sum_b * sum_b / pairs)
+        measures[9] = (sum_ab - sum_a * sum_b / pairs) / np.sqrt(spread) if spread > 0 else 0.0
+    order = np.argsort(tile, kind="mergesort")
+    M, H_tile, g_tile = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    start = 0
+    while start < n:
+        end = start
+        while end < n and tile[order[end]] == tile[order[start]]:
+            end += 1
+        rows = order[start:end]
+        normal_equations(points[rows], normals[rows], gradients[rows], across[rows], brightness[rows], moved[rows],
+                         sigma[rows], scales, H_tile, g_tile)  # fmt: skip
+        for a in range(6):
+            for b in range(6):
+                M[a, b] += g_tile[a] * g_tile[b]
+        start = end
+    return H, M, measures

@@ -1,0 +1,193 @@
+"""Direct alignment of RGB-D frames, and the motion of their features, on rendered views with known poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.datasets.simulation.rgbd_room import (
+    furnished_room,
+    loop_through_room,
+    noisy_depth,
+    render_rgbd,
+    small_camera,
+)
+from posegraph_slam.geometry import SE3
+from posegraph_slam.registration.features import detect_features, match_features, motion_of_matches
+from posegraph_slam.registration.result import RegistrationStatus
+from posegraph_slam.registration.rgbd_alignment import RgbdAlignmentSettings, align_frames
+from posegraph_slam.registration.rgbd_frame import RgbdFrame, prepare_frame, prepare_reference
+from posegraph_slam.registration.rgbd_kernels import Side, align_level, left_update, linearise
+
+CAMERA = small_camera(160, 120)
+SETTINGS = RgbdAlignmentSettings()
+POSES = loop_through_room(120)
+
+
+def view(T: FloatArray, *, noise: float = 0.0, seed: int = 0, gain: float = 1.0, camera=CAMERA) -> RgbdFrame:
+    rng = np.random.default_rng(seed)
+    colour, depth = render_rgbd(furnished_room(seed=3), camera, T)
+    if noise > 0:
+        colour = np.clip(np.rint(colour + 2 * rng.standard_normal(colour.shape)), 0, 255).astype(np.uint8)
+    colour = np.clip(np.rint(gain * colour.astype(float)), 0, 255).astype(np.uint8)
+    units = noisy_depth(depth, camera.depth_units_per_m, rng, noise=noise)
+    return prepare_frame(colour, units, camera.vector(), depth_units_per_m=camera.depth_units_per_m, max_depth_m=10.0)
+
+
+def error(T: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    tangent = SE3.local(truth, T)
+    return float(np.linalg.norm(tangent[3:])), float(np.rad2deg(np.linalg.norm(tangent[:3])))
+
+
+@pytest.mark.parametrize("step", [1, 2])
+@pytest.mark.parametrize("both", [False, True])
+def test_finds_the_motion_between_near_frames(step: int, both: bool) -> None:
+    target, source = prepare_reference(view(POSES[10])), view(POSES[10 + step])
+    truth = SE3.between(POSES[10], POSES[10 + step])
+    found = align_frames(target, prepare_reference(source) if both else source, np.eye(4), SETTINGS)
+    assert found.status is RegistrationStatus.CONVERGED
+    shift, turn = error(found.T_target_source, truth)
+    assert shift < 0.002
+    assert turn < 0.05
+    assert found.overlap > 0.6
+    assert found.agreement > 0.97
+    assert found.correlation > 0.9
+
+
+def test_a_change_of_exposure_does_not_move_it() -> None:
+    target, truth = prepare_reference(view(POSES[20])), SE3.between(POSES[20], POSES[21])
+    found = align_frames(target, view(POSES[21], gain=0.9), np.eye(4), SETTINGS)
+    assert found.usable
+    assert error(found.T_target_source, truth)[0] < 0.004
+
+
+def test_stated_uncertainty_covers_the_errors_of_noisy_frames() -> None:
+    # without the floors for what a simulation does not have: errors of calibration and of exposure
+    none = {"sigma_share": 0.0, "sigma_floor_m": 1e-6, "sigma_floor_rad": 1e-6}
+    settings = SETTINGS.model_copy(update=none)
+    squared = []
+    for k in range(0, 80, 8):
+        target, source = view(POSES[k], noise=1, seed=k), view(POSES[k + 1], noise=1, seed=100 + k)
+        found = align_frames(prepare_reference(target), prepare_reference(source), np.eye(4), settings)
+        assert found.usable
+        assert error(found.T_target_source, SE3.between(POSES[k], POSES[k + 1]))[0] < 0.006
+        tangent = SE3.local(found.T_target_source, SE3.between(POSES[k], POSES[k + 1]))
+        squared.append(tangent @ found.information @ tangent)
+        np.testing.assert_allclose(found.information, found.information.T)
+        assert np.linalg.eigvalsh(found.information)[0] > 0
+    # six degrees of freedom; neither boasting by more than a factor of two in sigma nor saying nothing
+    assert 0.5 < np.mean(squared) < 24
+
+
+def test_swapping_the_frames_inverts_the_motion() -> None:
+    a, b = prepare_reference(view(POSES[9], noise=1)), prepare_reference(view(POSES[10], noise=1, seed=1))
+    forth, back = align_frames(a, b, np.eye(4), SETTINGS), align_frames(b, a, np.eye(4), SETTINGS)
+    shift, turn = error(forth.T_target_source, SE3.inverse(back.T_target_source))
+    assert shift < 1e-3
+    assert turn < 0.02
+
+
+def test_views_of_other_places_are_refused_with_a_reason() -> None:
+    target, source = prepare_reference(view(POSES[0])), view(POSES[60])
+    found = align_frames(target, source, np.eye(4), SETTINGS)
+    assert not found.usable
+    assert found.problem
+
+
+def test_a_blank_wall_is_degenerate() -> None:
+    depth = np.full((120, 160), 10_000, np.uint16)
+    frame = prepare_frame(
+        np.full((120, 160, 3), 128, np.uint8), depth, CAMERA.vector(), depth_units_per_m=5000, max_depth_m=10
+    )
+    lenient = SETTINGS.model_copy(update={"correlation_min": -1.0})
+    found = align_frames(prepare_reference(frame), frame, np.eye(4), lenient)
+    assert found.status is RegistrationStatus.DEGENERATE
+    assert "only known to" in found.problem
+
+
+def test_a_frame_without_depth_has_too_few_points() -> None:
+    empty = prepare_frame(
+        np.zeros((120, 160, 3), np.uint8), np.zeros((120, 160), np.uint16), CAMERA.vector(),
+        depth_units_per_m=5000, max_depth_m=10,
+    )  # fmt: skip
+    found = align_frames(prepare_reference(empty), view(POSES[0]), np.eye(4), SETTINGS)
+    assert found.status is RegistrationStatus.TOO_FEW_POINTS
+
+
+def test_normals_face_the_camera_and_fit_the_surfaces() -> None:
+    reference = prepare_reference(view(POSES[0]))
+    p = reference.points[0]
+    flat = p.normals[:, 2] != 0
+    assert flat.mean() > 0.7
+    np.testing.assert_allclose(np.linalg.norm(p.normals[flat], axis=1), 1, atol=1e-9)
+    assert (np.sum(p.normals[flat] * p.points[flat], axis=1) < 0).all()
+    # every face of the room is along an axis of the world
+    world = np.abs(p.normals[flat] @ POSES[0][:3, :3].T)
+    assert np.quantile(world.max(axis=1), 0.1) > 0.98
+
+
+def test_the_gradient_vanishes_at_the_truth_and_points_back_beside_it() -> None:
+    target, source = prepare_reference(view(POSES[3])), view(POSES[4])
+    p, truth = target.points[0], SE3.between(POSES[3], POSES[4])
+    side = Side(p.points, p.normals, p.gradients, p.intensity, p.sigma_m,
+                source.intensity[0], source.depth[0], source.camera[0])  # fmt: skip
+    floors, H, g = np.array([0.3, 2.0]), np.zeros((6, 6)), np.zeros(6)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        off = rng.normal(0, 1, 6) * np.array([2e-3] * 3 + [4e-3] * 3)
+        linearise(side, left_update(truth, off), 0.06, floors, H, g)
+        step = -np.linalg.solve(H, g)
+        # one Gauss-Newton step undoes most of a small displacement
+        assert np.linalg.norm(step + off) < 0.5 * np.linalg.norm(off)
+    none = Side(*(values[:0] for values in side[:5]), *side[5:])
+    T, _, settled = align_level(side, none, truth, 0.06, 20, floors)
+    assert settled
+    assert error(T, truth)[0] < 2e-3
+
+
+LARGE = small_camera(320, 240)
+
+
+def test_features_find_a_wide_motion_that_alignment_alone_does_not() -> None:
+    a, b = view(POSES[0], camera=LARGE), view(POSES[10], camera=LARGE)
+    truth = SE3.between(POSES[0], POSES[10])
+    features = [detect_features(f.intensity[0], f.depth[0], f.camera[0]) for f in (a, b)]
+    pairs = match_features(*features)
+    motion = motion_of_matches(*features, pairs, inliers_min=15)
+    assert motion.found
+    assert motion.inliers <= motion.matches == len(pairs)
+    shift, turn = error(motion.T_target_source, truth)
+    assert shift < 0.08
+    assert turn < 2.0
+    refined = align_frames(prepare_reference(a), b, motion.T_target_source, SETTINGS)
+    assert refined.usable
+    assert error(refined.T_target_source, truth)[0] < 0.005
+    again = motion_of_matches(*features, pairs, inliers_min=15)
+    np.testing.assert_array_equal(again.T_target_source, motion.T_target_source)
+
+
+def test_features_of_unrelated_views_do_not_agree() -> None:
+    features = [
+        detect_features(f.intensity[0], f.depth[0], f.camera[0])
+        for f in (view(POSES[0], camera=LARGE), view(POSES[60], camera=LARGE))
+    ]
+    motion = motion_of_matches(*features, match_features(*features), inliers_min=20)
+    assert not motion.found
+
+
+def test_matches_are_mutual_nearest_neighbours() -> None:
+    frame = view(POSES[7], camera=LARGE)
+    features = detect_features(frame.intensity[0], frame.depth[0], frame.camera[0])
+    pairs = match_features(features, features)
+    assert len(pairs) > 100
+    np.testing.assert_array_equal(pairs[:, 0], pairs[:, 1])
+    bits = np.unpackbits(features.words.view(np.uint8), axis=1).astype(np.int64)
+    shuffled = np.random.default_rng(1).permutation(len(features))
+    other = type(features)(
+        points=features.points[shuffled], pixels=features.pixels[shuffled], words=features.words[shuffled],
+        camera=features.camera,
+    )  # fmt: skip
+    for i, j in match_features(features, other)[:50]:
+        distance = np.sum(bits[i][None] != bits[shuffled], axis=1)
+        assert distance[j] == distance.min()
