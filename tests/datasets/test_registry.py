@@ -45,6 +45,7 @@ def test_another_package_adds_a_reader_and_a_broken_one_is_left_out(entry_points
         "humanoid",
         "imu_vicon",
         "euroc",
+        "rgbd",
         "other",
     ]
     messages = " ".join(str(warning.message) for warning in caught)
