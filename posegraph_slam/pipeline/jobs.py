@@ -27,7 +27,8 @@ def optimize_log(
 ) -> JobResult:
     """Optimise a log by its laser scans, or by its RGB-D images where it has no scans.
 
-    `matched` and `close` are the scan matching of an earlier run and what gives its closures. Raises InputError for a log that has neither.
+    `matched` and `close` are the scan matching of an earlier run and what gives its closures. Raises InputError for a
+    log that has neither scans nor images.
     """
     if log.scans is None and log.rgbd_sequence is not None:
         if matched is not None:

@@ -10,8 +10,9 @@ from posegraph_slam.arrays import ByteArray, FloatArray
 from posegraph_slam.geometry import Trajectory, pose_from_rotation_translation
 from posegraph_slam.pipeline.optimize_rgbd import RgbdResult
 from posegraph_slam.pipeline.run_directory import RunDirectory
-from posegraph_slam.report.canvas import GREY, bounds_around, page
+from posegraph_slam.report.canvas import GREY, page
 from posegraph_slam.report.figures import PIXELS, draw_path, draw_segments, draw_trajectories, loop_segments
+from posegraph_slam.report.view import bounds_around
 
 PIXELS_ACROSS = 1400
 """Longer side of a picture of the cloud in pixels."""
