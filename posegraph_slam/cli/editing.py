@@ -26,6 +26,7 @@ def edit(
     import contextlib
     import threading
     import webbrowser
+    from shlex import quote
 
     from posegraph_slam.pipeline.run_directory import EDITS
     from posegraph_slam.report.edit_server import EditServer
@@ -43,4 +44,4 @@ def edit(
         edits = run / EDITS
         if edits.is_file() and not quiet:
             typer.echo(f"\nedits:    {edits}")
-            typer.echo(f"replay:   psg optimize {run} --from graph --edits {edits}")
+            typer.echo(f"replay:   psg optimize {quote(str(run))} --from graph --edits {quote(str(edits))}")

@@ -71,7 +71,7 @@ def content_policy(style: str, script: str, *, connect: bool) -> str:
     """Return the content security policy of a page with exactly this style and this script."""
     rules = [
         "default-src 'none'",
-        "img-src data: blob:",
+        "img-src data:",
         f"style-src {content_hash(style)}",
         f"script-src {content_hash(script)}",
         *(["connect-src 'self'"] if connect else []),

@@ -51,7 +51,7 @@ def middle_of(kind: str) -> str:
 
 def test_nothing_is_asked_of_a_network(page: Any) -> None:
     assert page.requests()
-    assert all(url.startswith(("file:///", "data:", "blob:")) for url in page.requests())
+    assert all(url.startswith(("file:///", "data:")) for url in page.requests())
 
 
 def test_every_layer_can_be_switched(fresh: Any) -> None:
