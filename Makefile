@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 SIMULATION := $(wildcard posegraph_slam/datasets/simulation/*.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint benchmark lock presets clean distclean
+.PHONY: help demo test lint benchmark lock presets wheel clean distclean
 
 help:
 	@echo 'make demo       install, simulate a small indoor log, optimise it, show the comparison and the pictures'
@@ -18,6 +18,7 @@ help:
 	@echo 'make benchmark  run benchmarks/*.py on the logs in PSG_DATA'
 	@echo 'make lock       write constraints.txt from what .venv holds'
 	@echo 'make presets    write configs/default.toml from the defaults in the code'
+	@echo 'make wheel      build the wheel, install it into a fresh environment and run it there (2 minutes)'
 	@echo 'make clean      remove caches, the demo and build output; distclean removes .venv too'
 
 $(BIN)/python:
@@ -58,6 +59,9 @@ lock: $(VENV)/.installed-dev
 
 presets: $(VENV)/.installed
 	@$(BIN)/psg config show > default.toml.new && mv default.toml.new configs/default.toml
+
+wheel: $(VENV)/.installed
+	@$(BIN)/python tools/check_wheel.py
 
 clean:
 	rm -rf demo build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

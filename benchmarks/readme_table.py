@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from references import REFERENCES
+from references import MEASURED, REFERENCES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, RESULTS = ROOT / "README.md", ROOT / "benchmarks" / "results" / "slam2d.json"
@@ -28,15 +28,15 @@ def readme_table(rows: Sequence[dict[str, Any]]) -> str:
             cpu = f"{by_log[log]['cpu_s']:.0f}" if stage == "optimised" else ""
             cells += [f"{metres:.4f}", f"{degrees:.2f}", cpu]
         name = "**posegraph_slam**" if stage == "optimised" else stage
-        lines.append(f"| {name} | {' | '.join(cells)} | this run |")
+        lines.append(f"| {name} | {' | '.join(cells)} | this benchmark |")
     for system, source in dict.fromkeys((each.system, each.source) for each in REFERENCES):
         cells = []
         for log in LOGS:
             known = next((r for r in REFERENCES if (r.log, r.system, r.source) == (log, system, source)), None)
             values = (None, None, None) if known is None else (known.metres, known.degrees, known.cpu_s)
             cells += ["" if value is None else f"{value:g}" for value in values]
-        lines.append(f"| {system} | {' | '.join(cells)} | {source} |")
-    return "\n".join(lines)
+        lines.append(f"| {system} | {' | '.join(cells)} | {'measured †' if source == MEASURED else source} |")
+    return "\n".join([*lines, "", f"† {MEASURED}."])
 
 
 def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from posegraph_slam.datasets.registry import read, recognised
 from posegraph_slam.datasets.relations import read_relations
 from posegraph_slam.errors import InputError
@@ -14,7 +16,7 @@ from posegraph_slam.evaluation.path import PathSummary, summarise_path
 from posegraph_slam.evaluation.relations import RelationErrors, relation_errors
 from posegraph_slam.evaluation.rpe import RelativePoseError, relative_pose_error
 from posegraph_slam.evaluation.statistics import ErrorStatistics
-from posegraph_slam.geometry import Relations, Trajectory
+from posegraph_slam.geometry import SE2, Relations, Trajectory
 from posegraph_slam.pipeline.convert import ConversionOptions, source_trajectory
 from posegraph_slam.pipeline.run_directory import RECORD
 
@@ -93,9 +95,13 @@ def evaluate(
 ) -> Evaluation:
     """Measure a trajectory against a reference: APE after `alignment`, RPE over `distances_m`, relations.
 
-    With sim3 the estimate is scaled before RPE and relations too. Raises InputError where they do not overlap in time.
+    A flat estimate (z, roll and pitch zero, as planar runs are written) counts as planar, so that auto aligns it in the
+    plane. With sim3 the estimate is scaled before RPE and relations too. Raises InputError where they do not overlap in
+    time.
     """
     paths = ape = rpe = None
+    if alignment == "auto" and is_flat(estimate):
+        alignment = "se2"
     scaled = estimate
     if reference.trajectory is not None:
         paths = align_paths(estimate, reference.trajectory, alignment=alignment, max_dt_s=max_dt_s)
@@ -106,3 +112,11 @@ def evaluate(
         rpe = relative_pose_error(scaled, reference.trajectory, distances_m=distances_m, max_dt_s=max_dt_s)
     relations = None if reference.relations is None else relation_errors(scaled, reference.relations)
     return Evaluation(path=summarise_path(estimate), ape=ape, rpe=rpe, relations=relations, paths=paths)
+
+
+def is_flat(trajectory: Trajectory) -> bool:
+    """Whether no pose leaves the xy-plane."""
+    if trajectory.group is SE2:
+        return True
+    upright = trajectory.poses[:, 2, 2] > 1 - 1e-12
+    return bool(upright.all() and np.abs(trajectory.poses[:, 2, 3]).max(initial=0.0) == 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import tracemalloc
 from pathlib import Path
 
@@ -90,6 +92,18 @@ def test_a_storage_file_without_metadata_is_read(tmp_path: Path) -> None:
     (folder / "metadata.yaml").unlink()
     assert len(scans_of(datasets.read(folder))) == COUNT
     assert len(scans_of(datasets.read(next(folder.glob("*.mcap"))))) == COUNT
+
+
+def test_a_bag_of_old_storage_without_message_definitions_is_read(tmp_path: Path) -> None:
+    folder = store_as("sqlite3", tmp_path, robot(maker_of("sqlite3")))
+    with contextlib.closing(sqlite3.connect(next(folder.glob("*.db3")))) as database:
+        database.executescript(
+            "DROP TABLE schema; DROP TABLE metadata; DROP TABLE message_definitions;"
+            "ALTER TABLE topics DROP COLUMN type_description_hash;"
+        )
+    log = datasets.read(folder)
+    np.testing.assert_array_equal(scans_of(log).ranges_m, seen(range(COUNT)))
+    assert log.odometry is not None
 
 
 def test_odometry_comes_from_the_frame_tree_where_no_topic_tells_it(tmp_path: Path) -> None:

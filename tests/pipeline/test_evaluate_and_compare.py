@@ -143,9 +143,11 @@ def test_compare_measures_against_a_truth_that_is_given(runs: tuple[Run, Path, P
 
 def test_evaluate_takes_a_run_and_a_log(runs: tuple[Run, Path, Path]) -> None:
     run, optimised, _ = runs
-    found = json.loads(psg("evaluate", optimised, run.log.path, "--align", "se2", "--json").stdout)
-    stored = run.metrics["stages"]["optimised"]["ape"]["translation_m"]["rmse"]
-    assert found["ape"]["translation_m"]["rmse"] == pytest.approx(stored, rel=1e-6)
+    found = json.loads(psg("evaluate", optimised, run.log.path, "--json").stdout)
+    stored = run.metrics["stages"]["optimised"]
+    assert found["ape"]["alignment"] == "se2"
+    for part in ("translation_m", "rotation_deg"):
+        assert found["ape"][part]["rmse"] == pytest.approx(stored["ape"][part]["rmse"], rel=1e-6, abs=1e-6)
 
 
 def test_compare_warns_of_what_does_not_compare(runs: tuple[Run, Path, Path], tmp_path: Path) -> None:
