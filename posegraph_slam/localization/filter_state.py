@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from posegraph_slam.arrays import FloatArray
@@ -27,7 +28,8 @@ class FilterState:
     """Everything the filter carries from scan to scan; poses are in the grid frame of the map.
 
     `anchor` is the last pose that was known, moved on by odometry since, and its covariance; it is what a lost robot
-    falls back to. `recent` are the last scans that weighed the particles, each with its odometry pose (3,).
+    falls back to. `recent` are the last scans that weighed the particles, each with its odometry pose (3,). At the
+    last search every other place fitted worse than hypothesis `favourite`, by `margin` in log-odds a return.
     """
 
     particles: Particles
@@ -38,6 +40,8 @@ class FilterState:
     next_hypothesis: int
     anchor: tuple[FloatArray, FloatArray] | None
     recent: tuple[tuple[FloatArray, ScanPoints], ...]
+    favourite: int = -1
+    margin: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

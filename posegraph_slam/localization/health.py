@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -20,7 +21,8 @@ class Health(IntEnum):
 class Evidence:
     """Of one scan at the best pose: returns in all, those that agree and those that conflict with the map.
 
-    `share` is the weight of the best hypothesis, number `hypothesis`, and `sigma_m` its spread.
+    `share` is the weight of the best hypothesis, number `hypothesis`, and `sigma_m` its spread; `margin` is how much
+    worse other places fitted when they were last looked for, in log-odds a return.
     """
 
     hypothesis: int
@@ -29,6 +31,7 @@ class Evidence:
     returns: int
     agree: int
     conflict: int
+    margin: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,4 +91,5 @@ def _judged(state: HealthState, evidence: Evidence, settings: HealthSettings) ->
     # Where a map is incomplete, something nearly fits in many places: a new place has to explain the whole scan.
     if state.agreement < settings.found_above or state.explained < settings.explained_min:
         return state.health
-    return Health.OK if certain and state.updates >= settings.updates_min else Health.AMBIGUOUS
+    alone = evidence.margin >= settings.rival_margin
+    return Health.OK if certain and alone and state.updates >= settings.updates_min else Health.AMBIGUOUS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from posegraph_slam.localization.filter_state import Estimate, FilterState, Prep
 from posegraph_slam.localization.health import Evidence, Health, HealthState, assess
 from posegraph_slam.localization.motion import propagate
 from posegraph_slam.localization.particles import Particles, around, joined, merged
-from posegraph_slam.localization.recovery import moved_on, recover
+from posegraph_slam.localization.recovery import compare, moved_on, recover
 from posegraph_slam.localization.resampling import effective_number, needed_number, occupied_bins, resample
 from posegraph_slam.localization.scan_points import ScanPoints, scan_points
 from posegraph_slam.localization.settings import LocalizationSettings
@@ -146,9 +147,12 @@ def update(
         return _reported(state, estimate(state, known, scan, settings))
     state = _weighed(state, known, scan, settings)
     state = _remember(state, scan, settings)
-    if state.health.health is not Health.OK and state.updates_since_search >= settings.search.every:
-        state = recover(state, known, settings, rng)
+    searched = state.health.health is not Health.OK and state.updates_since_search >= settings.search.every
+    if searched:
+        state, places = recover(state, known, settings, rng)
     found = estimate(state, known, scan, settings)
+    if searched:
+        state = compare(state, known, found, places, settings)
     field = known.field
     agree, conflict = agreement(
         scan.points, scan.sensor, found.pose, settings.health.agreement_m, field.kind, field.distance_m,
@@ -156,7 +160,7 @@ def update(
     )  # fmt: skip
     evidence = Evidence(
         hypothesis=found.hypothesis, share=found.share, sigma_m=found.sigma_m, returns=len(scan.points), agree=agree,
-        conflict=conflict,
+        conflict=conflict, margin=state.margin if found.hypothesis == state.favourite else -math.inf,
     )  # fmt: skip
     health = assess(state.health, evidence, settings.health)
     newly_lost = state.health.health is Health.OK and health.health is not Health.OK
@@ -200,7 +204,8 @@ def _weighed(state: FilterState, known: PreparedMap, scan: ScanPoints, settings:
 
 
 def _remember(state: FilterState, scan: ScanPoints, settings: LocalizationSettings) -> FilterState:
-    return replace(state, recent=(*state.recent, (state.odometry, scan))[-settings.search.scans :])
+    kept = max(settings.health.remembered_scans, settings.search.scans)
+    return replace(state, recent=(*state.recent, (state.odometry, scan))[-kept:])
 
 
 def _resampled(

@@ -133,7 +133,12 @@ class HealthSettings(Settings):
     sigma_max_m: float = Field(default=0.5, gt=0)
     """Position sigma above which the pose is ambiguous."""
     updates_min: int = Field(default=10, ge=1)
-    """Updates that a new hypothesis must survive before it is believed."""
+    """Updates that a new hypothesis must survive before it is believed,"""
+    rival_margin: float = Field(default=0.2, ge=0)
+    """and by how much, in log-odds a return, every other place must fit the remembered scans worse; 0.2 is about one
+    conflicting return more in fifteen."""
+    remembered_scans: int = Field(default=96, ge=1)
+    """Scans that rivals are compared by, the last ones that weighed the particles."""
 
     @model_validator(mode="after")
     def _check_order(self) -> HealthSettings:

@@ -12,8 +12,16 @@ from posegraph_slam.geometry import SE2, pose_from_xyt, wrap_angle, xyt_from_pos
 from posegraph_slam.localization.beam_model import add_log_likelihoods, agreement, refine
 from posegraph_slam.localization.global_search import build_search_stack, find_places
 from posegraph_slam.localization.health import Evidence, Health, HealthState, assess
-from posegraph_slam.localization.known_map import LocalizationResult, localize, prepare_map
+from posegraph_slam.localization.known_map import (
+    LocalizationResult,
+    initial_state,
+    localize,
+    predict,
+    prepare_map,
+    update,
+)
 from posegraph_slam.localization.map_field import build_map_field
+from posegraph_slam.localization.recovery import compare
 from posegraph_slam.localization.scan_points import scan_points
 from posegraph_slam.localization.settings import BeamModelSettings, HealthSettings, LocalizationSettings
 from posegraph_slam.mapping.grid import GridGeometry
@@ -99,6 +107,28 @@ def test_in_a_strange_place_it_never_claims_to_know(world: Any) -> None:
     grid = OccupancyGrid(geometry=geometry, log_odds=log_odds, observed=np.ones(log_odds.shape, dtype=bool))
     result, _, _ = run(world, start=False, grid=grid)
     assert not (result.health == Health.OK).any()
+
+
+def test_a_place_like_the_estimate_is_a_rival_and_others_are_not(world: Any) -> None:
+    """A map that holds the same hall twice: the other hall fits as well, other places in this one do not."""
+    log_odds = np.concatenate([world.grid.log_odds] * 2, axis=1)
+    geometry = GridGeometry(origin_m=world.grid.geometry.origin_m, resolution_m=0.05, shape=log_odds.shape)
+    known = prepare_map(OccupancyGrid(geometry=geometry, log_odds=log_odds, observed=log_odds != 0), SETTINGS)
+    beams, rng = prepare_beam_scans(world.scans, BeamScanSettings()), np.random.default_rng(0)
+    path = xyt_from_pose(world.odometry.poses)
+    state = initial_state(known, path[0], SETTINGS, rng=rng, start=world.truth[0])
+    for k in range(30):
+        scan = scan_points(beams, k, SETTINGS.beam_model.points_max)
+        state, found = update(predict(state, path[k], SETTINGS, rng), known, scan, SETTINGS, rng)
+    here = found.pose
+    assert np.linalg.norm(known.field.from_grid(here)[:2] - world.truth[29, :2]) < 0.1
+    other_hall, elsewhere = here + np.array([16.0, 0.0, 0.0]), known.field.to_grid(world.truth[[100, 150, 200]])
+    near = here + np.array([0.1, 0.1, 0.03])
+    alone = compare(state, known, found, np.concatenate([elsewhere, near[None]]), SETTINGS)
+    assert alone.margin > 2 * SETTINGS.health.rival_margin
+    rivalled = compare(state, known, found, np.concatenate([elsewhere, other_hall[None]]), SETTINGS)
+    assert abs(rivalled.margin) < 0.02
+    assert rivalled.favourite == found.hypothesis
 
 
 def test_same_seed_same_bytes_other_seed_other_bytes(world: Any) -> None:
@@ -201,6 +231,8 @@ def test_health_follows_the_evidence() -> None:
     assert judged(known, 50, agree=2, conflict=8).health is Health.OK  # off the map: nothing can be told
     assert judged(known, 1, sigma_m=2.0).health is Health.AMBIGUOUS
     assert judged(known, 1, share=0.6).health is Health.AMBIGUOUS
+    assert judged(fresh, 50, margin=0.1).health is Health.AMBIGUOUS  # somewhere else fits nearly as well
+    assert judged(known, 50, margin=0.1).health is Health.OK  # which does not end a track
     assert judged(fresh, 50, agree=25, conflict=3).health is not Health.OK  # most of the scan is unexplained
     assert judged(fresh, 50, agree=45, conflict=15).health is not Health.OK  # enough to keep a track, not to begin one
     assert judged(known, 50, agree=45, conflict=15).health is Health.OK

@@ -6,14 +6,17 @@ import csv
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from posegraph_slam.cli.application import app
 from posegraph_slam.datasets import read
 from posegraph_slam.datasets.simulation.humanoid import write_humanoid_log
 from posegraph_slam.datasets.tum import read_tum
+from posegraph_slam.geometry import SE2, pose_from_xyt, xyt_from_pose
 from posegraph_slam.mapping.nav2 import write_nav2
 from posegraph_slam.mapping.occupancy import build_occupancy
 from posegraph_slam.pipeline.configuration import Configuration
@@ -88,6 +91,45 @@ def test_localize_finds_the_start_by_itself(walk: Path, tmp_path: Path) -> None:
     truth = read_tum(walk.with_name("truth.tum"), parent="ref", child="base")
     found = read_tum(tmp_path / "run" / "trajectory.tum", parent="map", child="base")
     assert np.linalg.norm(found.positions[-1] - truth.positions[-1]) < 0.05
+
+
+@pytest.mark.parametrize(("mode", "negate", "yaw"), [("trinary", 1, 0.0), ("scale", 0, 0.4), ("raw", 0, -2.0)])
+def test_localize_takes_any_nav2_map(walk: Path, tmp_path: Path, mode: str, negate: int, yaw: float) -> None:
+    """The same map in another mode, with a turned and shifted origin: poses turn and shift with it."""
+    header = yaml.safe_load(walk.with_name("map.yaml").read_text())
+    pixels = cv2.imread(str(walk.with_name(header["image"])), cv2.IMREAD_UNCHANGED)
+    if mode == "raw":
+        pixels = np.select([pixels == 0, pixels >= 250], [100, 0], 255).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "map.png"), 255 - pixels if negate else pixels)
+    moved = SE2.exp(np.array([5.0, -3.0, yaw]))
+    origin = xyt_from_pose(moved @ pose_from_xyt(np.array(header["origin"], dtype=float)))
+    header |= {"image": "map.png", "mode": mode, "negate": negate, "origin": origin.tolist()}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(header))
+    truth = read_tum(walk.with_name("truth.tum"), parent="ref", child="base").poses[:, [0, 1, 3]][:, :, [0, 1, 3]]
+    x, y, heading = xyt_from_pose(moved @ truth[0])
+    invoke("localize", str(tmp_path / "map.yaml"), str(walk), "--out", str(tmp_path / "run"),
+           "--start", f"{x},{y},{heading}")  # fmt: skip
+    found = read_tum(tmp_path / "run" / "trajectory.tum", parent="map", child="base")
+    error = np.linalg.norm(found.positions[:, :2] - (moved @ truth)[:, :2, 2], axis=1)
+    assert np.median(error) < 0.04
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["health"]["ok"] == len(found)
+
+
+def test_pf_slam_with_a_map_for_each_particle(walk: Path, tmp_path: Path) -> None:
+    out = invoke("pf-slam", str(walk), "--out", str(tmp_path / "run"), "--set", "particle_slam.maps=per_particle",
+                 "--set", "particle_slam.particles=10", "--json")  # fmt: skip
+    metrics = json.loads(out)["metrics"]
+    rows = {row["metric"]: row["values"] for row in metrics["table"]["rows"]}
+    assert rows["APE position RMSE"]["particle filter"] < 0.08
+    assert metrics["map_memory_mib"] > 0
+
+
+def test_maps_of_particles_and_filled_polygons_exclude_each_other(walk: Path, tmp_path: Path) -> None:
+    arguments = ["pf-slam", str(walk), "--out", str(tmp_path / "run"), "--set", "particle_slam.maps=per_particle",
+                 "--set", "particle_slam.free_cells=polygon"]  # fmt: skip
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "need free_cells rays" in result.output
 
 
 def test_pf_slam_maps_and_compares(walk: Path, tmp_path: Path) -> None:
