@@ -78,7 +78,7 @@ BUILT_IN = (
     _built_in(
         "rosbag",
         "bag of ROS 1 or ROS 2: laser scans or point clouds, odometry, IMU, images and frames (TF)",
-        "a file .bag (ROS 1), .mcap or .db3 (ROS 2), or the folder of a ROS 2 bag with its metadata.yaml",
+        "a file .bag (ROS 1), .mcap or .db3 (ROS 2), the folder of a ROS 2 bag, or a folder of split .bag files",
         topics=True,
     ),
     _built_in(

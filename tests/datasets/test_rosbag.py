@@ -33,6 +33,7 @@ from .bag_writing import (
     robot,
     stamp_at,
     store_as,
+    write_bag,
     xyt_at,
 )
 
@@ -92,6 +93,25 @@ def test_a_storage_file_without_metadata_is_read(tmp_path: Path) -> None:
     (folder / "metadata.yaml").unlink()
     assert len(scans_of(datasets.read(folder))) == COUNT
     assert len(scans_of(datasets.read(next(folder.glob("*.mcap"))))) == COUNT
+
+
+def test_a_folder_of_split_bags_is_one_recording(tmp_path: Path) -> None:
+    maker = Maker(ros2=False)
+    entries = robot(maker, COUNT)
+    pixels = np.arange(4, dtype=np.uint8).reshape(2, 2)
+    entries.append(("/cam", "sensor_msgs/msg/Image", stamp_at(COUNT), maker.image(stamp_at(COUNT), pixels, "mono8")))
+    whole = datasets.read(store_as("ros1", tmp_path / "whole", entries))
+    middle = len(entries) // 2
+    for number, part in enumerate((entries[:middle], entries[middle:])):
+        write_bag(tmp_path / "split" / f"drive_{number}.bag", part, maker)
+    split = datasets.read(tmp_path / "split")
+    np.testing.assert_array_equal(scans_of(split).ranges_m, scans_of(whole).ranges_m)
+    np.testing.assert_array_equal(scans_of(split).T_base_lidar, scans_of(whole).T_base_lidar)
+    assert split.odometry is not None
+    assert whole.odometry is not None
+    np.testing.assert_array_equal(split.odometry.poses, whole.odometry.poses)
+    np.testing.assert_array_equal(next(split.images[0].images()), pixels)
+    assert "the folder's 2 bags are read as one recording" in split.remarks
 
 
 def test_a_bag_of_old_storage_without_message_definitions_is_read(tmp_path: Path) -> None:

@@ -45,15 +45,19 @@ def is_bag(path: Path) -> bool:
     try:
         if path.is_dir():
             metadata = path / METADATA
-            return (metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:4096]) or bool(
-                _storage_files(path)
-            )
+            described = metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:4096]
+            return described or bool(_storage_files(path)) or bool(split_files(path))
         if path.suffix not in (".bag", *STORAGES):
             return False
         with path.open("rb") as file:
             return file.read(16).startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
     except OSError:
         return False
+
+
+def split_files(folder: Path) -> list[Path]:
+    """Return the .bag files of a folder, in the order of their names: the parts of a recording that was split."""
+    return sorted(folder.glob("*.bag"))
 
 
 def _storage_files(folder: Path) -> list[Path]:
@@ -133,7 +137,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
     try:
         # the reader keeps what it opened in one stack, closed even when opening fails halfway
-        reader = AnyReader([_file(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader(_files(path), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except InputError:
         raise
@@ -146,15 +150,17 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader.close()
 
 
-def _file(path: Path) -> Path:
-    """Return what to open: the folder with its metadata, or the one storage file in a folder without."""
+def _files(path: Path) -> list[Path]:
+    """Return what to open: the folder with its metadata, else all .bag files, else the one storage file in it."""
     if not path.is_dir() or (path / METADATA).is_file():
-        return path
+        return [path]
+    if parts := split_files(path):
+        return parts
     files = _storage_files(path)
     if len(files) != 1:
         names = ", ".join(file.name for file in files) or "none"
         raise InputError(path, f"has no {METADATA} and not one storage file ({names})", "run `ros2 bag reindex`")
-    return files[0]
+    return files
 
 
 def first_line(error: BaseException) -> str:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-from posegraph_slam.datasets.rosbag.bag import is_bag, open_bag
+from posegraph_slam.datasets.rosbag.bag import is_bag, open_bag, split_files
 from posegraph_slam.datasets.rosbag.body import BodyFrames
 from posegraph_slam.datasets.rosbag.clock import refuse_other_clock
 from posegraph_slam.datasets.rosbag.collecting import collect
@@ -31,6 +31,8 @@ def read(path: str | Path, topics: Mapping[str, str] | None = None) -> RobotLog:
     path = Path(path)
     remarks: list[str] = []
     with open_bag(path) as bag:
+        if path.is_dir() and not bag.is_ros2:
+            remarks.append(f"the folder's {len(split_files(path))} bags are read as one recording")
         choice = choose(bag, topics or {})
         remarks.append(choice.sentence(unused(bag, choice)))
         found = collect(bag, choice)
