@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from posegraph_slam.datasets.trajectory_files import read_trajectory
+from posegraph_slam.errors import InputError
 from posegraph_slam.execution import Progress, silent_progress
 from posegraph_slam.pipeline.configuration import Configuration, usable_workers
 from posegraph_slam.pipeline.editing import check_log, close_with_edits, planar
@@ -64,6 +65,8 @@ def run(
         with clock.stage("reading"):
             if truth is not None:
                 log = dataclasses.replace(log, truth=read_trajectory(truth))
+            if matching_of is not None and log.scans is None:
+                raise InputError(matching_of, "is the run of a log without laser scans", "start it over at `matching`")
             if matching_of is not None and log.scans is not None:
                 earlier = read_run_directory(matching_of)
                 matched = read_matching(earlier.path(MATCHING), len(log.scans))
