@@ -20,6 +20,7 @@ class Method(StrEnum):
     """How the orientation is estimated."""
 
     UKF = "ukf"
+    SMOOTHER = "smoother"
     COMPLEMENTARY = "complementary"
     GYRO = "gyro"
 
@@ -100,7 +101,7 @@ def record(
         "method": method.value,
         "stamps": len(estimate),
         "gyro_bias_rad_s": [float(value) for value in estimate.gyro_bias[-1]],
-        "accelerometer_used_share": estimate.corrected_share if method is Method.UKF else None,
+        "accelerometer_used_share": estimate.corrected_share if estimate.covariance is not None else None,
         "errors": {name.value: each.as_dict() for name, each in errors.items()},
         "remarks": remarks,
     }

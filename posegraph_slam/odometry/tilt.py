@@ -84,7 +84,8 @@ def estimate_tilt(encoders: WheelEncoders, imu: Imu, settings: TiltSettings) -> 
     """Find roll and pitch of a wheeled robot at every IMU stamp.
 
     The base moves along its x axis with speed v, so that the accelerometer shows gravity and [v', v w_z, -v w_y]; the
-    latter is taken off. Raises InputError for an IMU without acceleration or a clock that runs backwards.
+    latter is taken off. The filter is smoothed backwards. Raises InputError for an IMU without acceleration or a clock
+    that runs backwards.
     """
     R_base_imu = imu.T_base_imu[:3, :3]
     omega, accel = imu.angular_velocity @ R_base_imu.T, imu.linear_acceleration @ R_base_imu.T
@@ -95,7 +96,7 @@ def estimate_tilt(encoders: WheelEncoders, imu: Imu, settings: TiltSettings) -> 
     if settings.wheel_acceleration:
         accel = accel - motion_acceleration(encoders, imu.stamps_s, omega - bias, settings.wheel_smoothing_s)
     base = Imu(stamps_s=imu.stamps_s, angular_velocity=omega, linear_acceleration=accel, T_base_imu=np.eye(4))
-    estimate = estimate_attitude(base, settings.attitude)
+    estimate = estimate_attitude(base, settings.attitude, method="smoother")
     return Tilt(
         stamps_s=imu.stamps_s,
         rotations=estimate.rotations,

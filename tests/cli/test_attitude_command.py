@@ -47,9 +47,9 @@ def test_writes_every_stamp_and_prints_the_table(run: Path, tmp_path: Path) -> N
     assert rows.shape == (600, 8)
     assert not rows[:, 1:4].any()
     assert Rotation.from_quat(rows[-1, 4:]).as_euler("ZYX", degrees=True)[0] == pytest.approx(90, abs=1)
-    header, *methods = result.stdout.splitlines()[:4]
+    header, *methods = result.stdout.splitlines()[:5]
     assert header.split()[2:5] == ["roll", "pitch", "yaw"]
-    assert [row.split()[0] for row in methods] == ["ukf", "complementary", "gyro"]
+    assert [row.split()[0] for row in methods] == ["ukf", "smoother", "complementary", "gyro"]
     assert all(float(row.split()[3]) < 1.0 for row in methods)
     assert figure.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert [path.name for path in out.parent.iterdir()] == ["a.tum"]
@@ -60,7 +60,7 @@ def test_json_is_all_of_stdout(run: Path, tmp_path: Path) -> None:
     record = json.loads(result.stdout)
     assert record["method"] == "complementary"
     assert record["stamps"] == 600
-    assert set(record["errors"]) == {"ukf", "complementary", "gyro"}
+    assert set(record["errors"]) == {"ukf", "smoother", "complementary", "gyro"}
     assert record["errors"]["ukf"]["nees"] > 0
     assert record["errors"]["gyro"]["nees"] is None
 

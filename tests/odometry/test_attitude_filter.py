@@ -108,7 +108,7 @@ def test_no_drift_at_rest() -> None:
     accel = Rotation.from_euler("xyz", [0.1, -0.2, 0.0]).as_matrix().T @ UP * STANDARD_GRAVITY
     imu = Imu(stamps_s=np.arange(n) / RATE_HZ, angular_velocity=np.tile(bias, (n, 1)),
               linear_acceleration=np.tile(accel, (n, 1)), T_base_imu=np.eye(4))  # fmt: skip
-    for method in ("ukf", "complementary", "gyro"):
+    for method in ("ukf", "smoother", "complementary", "gyro"):
         R = estimate_attitude(imu, method=method).rotations
         assert angle(R[0], R[-1]) < 1e-6
         np.testing.assert_allclose(R[-1, 2], accel / STANDARD_GRAVITY, atol=1e-6)

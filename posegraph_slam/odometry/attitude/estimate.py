@@ -13,7 +13,7 @@ from posegraph_slam.odometry.attitude.complementary import complementary_stream
 from posegraph_slam.odometry.attitude.quaternions import rotation_from_wxyz, wxyz_from_rotation
 from posegraph_slam.odometry.attitude.settings import AttitudeMethod, AttitudeSettings
 from posegraph_slam.odometry.attitude.start import find_start
-from posegraph_slam.odometry.attitude.ukf import initial_state, run_ukf
+from posegraph_slam.odometry.attitude.ukf import initial_state, run_ukf, smoothed
 from posegraph_slam.sensors import STANDARD_GRAVITY, Imu
 
 
@@ -55,7 +55,8 @@ def estimate_attitude(
     """Estimate the orientation of the base at every IMU stamp from gyro and accelerometer.
 
     Rates and accelerations are turned into the base by `T_base_imu`; the lever arm is neglected. Rates that are NaN are
-    unknown. Raises `InputError` for an IMU without samples, one whose clock runs backwards or without acceleration.
+    unknown. `smoother` is the filter with a backward pass, by which later samples correct earlier ones. Raises
+    `InputError` for an IMU without samples, one whose clock runs backwards or without acceleration.
     """
     settings = settings or AttitudeSettings()
     _check(imu)
@@ -64,8 +65,10 @@ def estimate_attitude(
     start = find_start(imu.stamps_s, omega, accel, settings)
     dt, rates = steps(imu.stamps_s, omega, settings.max_gap_s)
     share, covariance, bias = 0.0, None, np.tile(start.gyro_bias, (len(imu), 1))
-    if method == "ukf":
+    if method in ("ukf", "smoother"):
         stream = run_ukf(initial_state(start, settings), dt, rates, accel, settings=settings)
+        if method == "smoother":
+            stream = smoothed(stream, dt, rates, settings=settings)
         quat_wxyz, bias = stream.quat_wxyz, stream.gyro_bias
         R = rotation_from_wxyz(quat_wxyz)
         covariance = R.transpose(0, 2, 1) @ stream.covariance[:, :3, :3] @ R

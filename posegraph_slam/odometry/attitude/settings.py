@@ -8,7 +8,7 @@ from pydantic import Field
 
 from posegraph_slam.settings import Settings
 
-AttitudeMethod = Literal["ukf", "complementary", "gyro"]
+AttitudeMethod = Literal["smoother", "ukf", "complementary", "gyro"]
 
 
 class AttitudeSettings(Settings):

@@ -10,6 +10,7 @@ from posegraph_slam.arrays import BoolArray, FloatArray, read_only
 from posegraph_slam.odometry.attitude.quaternions import rotation_from_wxyz, wxyz_from_rotation
 from posegraph_slam.odometry.attitude.settings import AttitudeSettings
 from posegraph_slam.odometry.attitude.sigma_points import POINTS, STATE, correct, filter_stream, predict_core
+from posegraph_slam.odometry.attitude.smoother import smooth_stream
 from posegraph_slam.odometry.attitude.start import Start
 from posegraph_slam.sensors import STANDARD_GRAVITY
 
@@ -89,6 +90,17 @@ def run_ukf(
     noise = gyro_noise(settings), accelerometer_noise(settings)
     q, bias, P, used = filter_stream(dt, omega, accel, *noise, *state.copies())
     return UkfStream(quat_wxyz=q, gyro_bias=bias, covariance=P, corrected=used)
+
+
+def smoothed(stream: UkfStream, dt: FloatArray, omega: FloatArray, *, settings: AttitudeSettings) -> UkfStream:
+    """Let later samples correct earlier ones: the stream that `run_ukf` made of the same `dt` and `omega`, smoothed.
+
+    Covariances are those of the smoothed estimates; the last sample stays what it was.
+    """
+    q, bias, P = stream.quat_wxyz.copy(), stream.gyro_bias.copy(), stream.covariance.copy()
+    dt, omega = (np.ascontiguousarray(each, dtype=np.float64) for each in (dt, omega))
+    smooth_stream(dt, omega, gyro_noise(settings), q, bias, P)
+    return UkfStream(quat_wxyz=q, gyro_bias=bias, covariance=P, corrected=stream.corrected)
 
 
 def gyro_noise(settings: AttitudeSettings) -> FloatArray:
