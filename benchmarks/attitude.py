@@ -2,9 +2,9 @@
 
     PSG_DATA=folder python benchmarks/attitude.py
 
-Writes benchmarks/results/attitude.json. Speed is CPU time of one core, compiled kernels, over a stream of 200 000 samples; the
-time to compile is apart. "left out" runs get the gyro gains that the other runs give by gravity alone, starting from
-the data sheet; "data sheet" runs get none.
+Writes benchmarks/results/attitude.json. Speed is CPU time of one core, compiled kernels, over a stream of 200 000
+samples; the time to compile is apart. "left out" runs get the gyro gains that the other runs give by gravity alone,
+starting from the data sheet; "data sheet" runs get none.
 """
 
 from __future__ import annotations

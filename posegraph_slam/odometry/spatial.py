@@ -31,7 +31,7 @@ class SpatialOdometrySettings(Settings):
     """Noise of heights, beside that of the tilt."""
 
     tilt: TiltSettings = TiltSettings()
-    height_per_sqrt_m: float = Field(default=0.02, gt=0)
+    height_per_sqrt_m: float = Field(default=0.03, gt=0)
     """m of height sigma after driving 1 m: tilt errors that come and go,"""
     height_per_m: float = Field(default=0.005, ge=0)
     """and the share of the way by which heights drift, from a tilt that is wrong for long."""

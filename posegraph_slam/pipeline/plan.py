@@ -13,6 +13,7 @@ SOURCES = {
     "wheels": "integrate the wheel encoders into odometry, since there is no gyro",
     "none": "start without odometry: the motion is found by scan matching alone",
 }
+IN_SPACE = "find roll, pitch and height from IMU and wheels, and level the scans"
 
 
 def describe(log: RobotLog, configuration: Configuration) -> list[str]:
@@ -25,8 +26,12 @@ def describe(log: RobotLog, configuration: Configuration) -> list[str]:
         return _rgbd_steps(log, log.rgbd_sequence, configuration)
     if scans is None or len(scans) == 0:
         return ["refuse the log: it has no laser scans, and scan matching needs them"]
+    in_space = configuration.pose_graph.group == "se3"
+    if in_space and (log.imu is None or log.encoders is None):
+        missing = "IMU" if log.imu is None else "wheel encoders"
+        return [f'refuse the log: it has no {missing}, which poses in space need (pose_graph.group = "se3")']
     steps = [
-        SOURCES[chosen_source(log, configuration.odometry.source)],
+        IN_SPACE if in_space else SOURCES[chosen_source(log, configuration.odometry.source)],
         f"match {len(scans)} scans of {scans.beams} beams one after another",
         "choose keyframes, propose loop closures, verify each, and solve the pose graph until no new one is found",
         _occupancy_step(configuration),

@@ -17,6 +17,8 @@ from posegraph_slam.settings import Settings
 
 FREE_INFORMATION = 1e-4
 """Of a direction that a constraint leaves free: one sigma of 100 m or rad, and still invertible."""
+UNEVEN = 0.05
+"""Rise over distance by which a ground differs from the plane that two poses on it span."""
 NEAREST_PLACES = 24
 """Keyframes around one among which the place is sought that the robot passed before."""
 
@@ -32,10 +34,10 @@ class SpatialSettings(Settings):
     """nor turns further. On a ramp little but the side walls is left to match, and those slide along themselves."""
     tilt_sigma_min_rad: float = Field(default=0.004, gt=0)
     """Roll and pitch of a keyframe are not known better than this, whatever the filter says."""
-    same_ground_m: float = Field(default=0.4, ge=0)
+    same_ground_m: float = Field(default=0.6, ge=0)
     """Keyframes this near in the plan view stand on one and the same ground; 0: this is not used."""
     same_ground_sigma_m: float = Field(default=0.02, gt=0)
-    """To within this."""
+    """To within this, and a twentieth of their distance."""
     level_gap_m: float = Field(default=0.5, gt=0)
     """Places whose heights differ by more than this, beyond their sigma, are on two levels: no loop joins them."""
 
@@ -181,7 +183,8 @@ def _one_ground(poses: FloatArray, lift: _Lift, heights: Heights) -> Constraints
     # equal grounds: the bases differ by the rise, the scanners by what their tilts add
     level[:, 2, 3] = rise + T_level_base_i[:, 2, 3] - T_level_base_j[:, 2, 3]
     information = np.tile(FREE_INFORMATION * np.eye(6), (len(pairs), 1, 1))
-    information[:, 5, 5] = 1.0 / (settings.same_ground_sigma_m**2 + bend**2)
+    uneven = UNEVEN * np.linalg.norm(step, axis=1)
+    information[:, 5, 5] = 1.0 / (settings.same_ground_sigma_m**2 + uneven**2 + bend**2)
     return _between_bases(i, j, level, information, lift, np.full(len(pairs), int(ConstraintKind.SAME_GROUND)))
 
 

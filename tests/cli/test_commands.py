@@ -9,6 +9,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -87,6 +88,24 @@ def test_simulate_is_deterministic_and_careful(log: Path, tmp_path: Path) -> Non
     assert "overwrite" in fails("simulate", "--out", again, "--seed", "6", *SMALL)
     assert psg("simulate", "--out", again, "--seed", "6", "--overwrite", *SMALL).exit_code == 0
     assert any((again / file.name).read_bytes() != file.read_bytes() for file in log.iterdir())
+
+
+def test_a_world_of_ramps_is_optimised_in_space(tmp_path: Path) -> None:
+    small = ("--set", "lidar.beams=271", "--set", "lidar.rate_hz=5", "--set", "drive.duration_s=25")
+    log, run = tmp_path / "hills", tmp_path / "run"
+    assert psg("simulate", "--world", "ramps", "--out", log, "--seed", "3", *small, "--quiet").exit_code == 0
+    world = json.loads((log / "world.json").read_text())
+    assert len(world["ground_xa_xb_ya_yb_z_rise"]) > 5
+    result = psg("optimize", log, "--set", "pose_graph.group=se3", "--out", run, "--quiet")
+    assert result.exit_code == 0, result.output
+    rows, true = (np.loadtxt(file) for file in (run / "trajectory.tum", log / "truth1.tum"))
+    assert np.ptp(true[:, 3]) > 0.2
+    assert np.abs((rows[:, 3] - rows[0, 3]) - (true[:, 3] - true[0, 3])).max() < 0.1
+    assert "VERTEX_SE3:QUAT" in (run / "graph.g2o").read_text()
+    again = psg("optimize", run, "--from", "graph", "--out", tmp_path / "again", "--quiet")
+    assert again.exit_code == 0, again.output
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "again" / "trajectory.tum"), rows, atol=1e-6)
+    assert "images are not rendered" in fails("simulate", "--set", "world.kind=ramps", "--out", tmp_path / "x")
 
 
 def test_simulate_names_wrong_settings(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.execution import SerialExecutor
 from posegraph_slam.geometry import SE2, pose_from_xyt
 from posegraph_slam.loop_closure import closing
@@ -64,6 +64,21 @@ def test_a_bent_chain_is_straightened(laps: Laps) -> None:
         )
         assert np.hypot(error[0], error[1]) < 0.1
     assert all(record.reason for record in result.records if not record.accepted)
+
+
+def test_places_that_are_apart_are_never_joined(laps: Laps) -> None:
+    half = len(laps.graph) // 2
+
+    def apart(i: IntArray, j: IntArray, distance_m: FloatArray) -> BoolArray:
+        assert (distance_m >= 0).all()
+        return np.asarray((i < half) & (j >= half))
+
+    result = close_loops(laps.graph, laps.scans, LoopClosureSettings(), SOLVER, apart=apart)
+    refused = [record for record in result.records if record.reason == "on another level"]
+    assert len(refused) > 10
+    assert all(record.target < half <= record.source for record in refused)
+    loops = result.graph.constraints.select(result.graph.constraints.is_loop)
+    assert not ((loops.i < half) & (loops.j >= half)).any()
 
 
 def test_two_workers_give_the_same_bytes(laps: Laps) -> None:

@@ -12,7 +12,7 @@ from posegraph_slam.errors import ConfigurationError
 from posegraph_slam.geometry import Relations, Trajectory
 from posegraph_slam.pipeline.configuration import load_configuration
 from posegraph_slam.pipeline.plan import describe
-from posegraph_slam.sensors import LaserScans, RgbdFrames, RobotLog, WheelEncoders
+from posegraph_slam.sensors import Imu, LaserScans, RgbdFrames, RobotLog, WheelEncoders
 
 STAMPS = np.arange(3.0)
 TRAJECTORY = Trajectory(stamps_s=STAMPS, poses=np.tile(np.eye(3), (3, 1, 1)), parent="odom", child="base")
@@ -34,6 +34,21 @@ def log() -> RobotLog:
 
 def plan(log: RobotLog, *overrides: str) -> str:
     return "\n".join(describe(log, load_configuration(overrides=overrides)))
+
+
+def test_poses_in_space(log: RobotLog) -> None:
+    assert "refuse the log: it has no IMU" in plan(log, "pose_graph.group=se3")
+    still = np.zeros((3, 3))
+    imu = Imu(stamps_s=STAMPS, angular_velocity=still, linear_acceleration=still + 9.8, T_base_imu=np.eye(4))
+    log = dataclasses.replace(log, imu=imu)
+    assert "no wheel encoders" in plan(log, "pose_graph.group=se3")
+    ticks = np.zeros((3, 2), dtype=np.int64)
+    encoders = WheelEncoders(
+        stamps_s=STAMPS, ticks_left=ticks, ticks_right=ticks, metres_per_tick=0.002, track_width_m=0.7
+    )
+    log = dataclasses.replace(log, encoders=encoders)
+    assert "level the scans" in plan(log, "pose_graph.group=se3")
+    assert "level the scans" not in plan(log)
 
 
 def test_source_of_the_odometry(log: RobotLog) -> None:
