@@ -43,12 +43,12 @@ class Run:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The optimised trajectory, map -> base, a pose for every scan."""
+        """The optimised trajectory, map -> base, a pose for every scan; map -> camera, every frame, of an RGB-D log."""
         return self.result.trajectory
 
     @property
     def stages(self) -> Mapping[str, Trajectory]:
-        """Trajectories by name: odometry, scan matching, optimised."""
+        """Trajectories by name: odometry, scan matching (of scans), optimised."""
         return self.result.stages
 
     @property
@@ -135,7 +135,7 @@ def optimize(
     workers: int | None = None,
     progress: Progress = silent_progress,
 ) -> Run:
-    """Find the trajectory of a robot and its maps in a log, given as such or by its path.
+    """Find the trajectory of a robot, or of an RGB-D camera, and its maps in a log, given as such or by its path.
 
     `config` changes the defaults: a dict of keys (`{"mapping.resolution_m": 0.1}` or nested), the name of a preset, a
     TOML file, or a whole `Configuration`; `seed` and `workers` win over it. `truth` are true body poses (a file or a
