@@ -36,6 +36,7 @@ HOMES = {
     "rerun": ("report/viewer.py",),
     "rosbags": ("datasets/rosbag/",),
     "cv2": (
+        "datasets/rgbd_writing.py",
         "datasets/rosbag/images.py",
         "datasets/simulation/files.py",
         "datasets/simulation/rgbd_room.py",

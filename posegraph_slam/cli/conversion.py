@@ -15,7 +15,7 @@ def convert(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Trajectory, log, run directory or cloud.")],
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="File or folder to write.")],
     to: Annotated[
-        str | None, typer.Option("--to", help="tum, kitti, euroc, csv, carmen, ece276a or ply; else by suffix.")
+        str | None, typer.Option("--to", help="tum, kitti, euroc, csv, carmen, ece276a, rgbd, ply; else by suffix.")
     ] = None,
     source_format: Annotated[
         str | None, typer.Option("--format", help="Format of SOURCE, where it is not recognised.")

@@ -13,6 +13,7 @@ from posegraph_slam.datasets.clouds import is_cloud, read_cloud
 from posegraph_slam.datasets.ece276a_writing import write_ece276a
 from posegraph_slam.datasets.ply import write_ply
 from posegraph_slam.datasets.registry import recognised
+from posegraph_slam.datasets.rgbd_writing import write_rgbd
 from posegraph_slam.datasets.trajectory_files import (
     TRAJECTORY_FORMATS,
     format_of_suffix,
@@ -25,7 +26,9 @@ from posegraph_slam.odometry.scan_odometry import chosen_source, odometry_at_sca
 from posegraph_slam.pipeline.run_directory import RECORD
 from posegraph_slam.sensors import RobotLog
 
-LOG_FORMATS = ("carmen", "ece276a")
+LOG_FORMATS = ("carmen", "ece276a", "rgbd")
+FOLDERS = {"ece276a": "Hokuyo*.npz", "rgbd": "depth.txt"}
+"""Formats that are folders, and a file by which one of ours is known."""
 TARGETS = (*TRAJECTORY_FORMATS, *LOG_FORMATS, "ply")
 STREAMS = ("odometry", "truth")
 LOG_SUFFIXES = {".clf": "carmen", ".log": "carmen", ".ply": "ply", "": "ece276a"}
@@ -66,17 +69,17 @@ def convert(
 ) -> Conversion:
     """Write `source` to `target` in the format `to`, or in that of the target's suffix.
 
-    Trajectory files and run directories (their trajectory) become tum, kitti, euroc or csv; logs become carmen or
-    ece276a, or a trajectory: their odometry or truth (`options.stream`); clouds become ply. Raises InputError naming
-    what does not fit, and where `target` exists and `overwrite` is not set.
+    Trajectory files and run directories (their trajectory) become tum, kitti, euroc or csv; logs become carmen, ece276a
+    or rgbd (their colour and depth images), or a trajectory: their odometry or truth (`options.stream`); clouds become
+    ply. Raises InputError naming what does not fit, and where `target` exists and `overwrite` is not set.
     """
     options = options or ConversionOptions()
     name = target_format(target, to)
     if not source.exists():
         raise InputError(source, "no such file or folder", "check the path")
-    if target.exists() and (not overwrite or target.is_dir() != (name == "ece276a")):
+    if target.exists() and (not overwrite or target.is_dir() != (name in FOLDERS)):
         raise InputError(target, "exists", "add --overwrite to replace a file, or choose another target")
-    if target.is_dir() and not any(target.glob("Hokuyo*.npz")) and any(target.iterdir()):
+    if target.is_dir() and not any(target.glob(FOLDERS[name])) and any(target.iterdir()):
         raise InputError(target, "is a folder of other things", "choose another target; it is not overwritten")
     if name in TRAJECTORY_FORMATS:
         trajectory, remarks = source_trajectory(source, options)
@@ -125,6 +128,9 @@ def source_trajectory(source: Path, options: ConversionOptions) -> tuple[Traject
 
 
 def _write_log(log: RobotLog, target: Path, name: str) -> Conversion:
+    if name == "rgbd":
+        count, remarks = write_rgbd(log, target)
+        return Conversion(target=target, format=name, count=count, unit="frames", remarks=(*log.remarks, *remarks))
     estimate = odometry_at_scans(log)
     remarks = [*log.remarks, *estimate.remarks]
     assert log.scans is not None

@@ -185,3 +185,39 @@ def euroc_like(folder: Path) -> Path:
     file = folder / "data.csv"
     file.write_text("#timestamp [ns],w_RS_S_x [rad s^-1]\n" + "".join(f"{10**9 + k},0,0,0,0,0,9.8\n" for k in range(9)))
     return file
+
+
+def test_a_bag_of_an_rgbd_camera_becomes_a_folder_that_is_read(tmp_path: Path) -> None:
+    from ..datasets.bag_writing import Entry, Maker, stamp_at, store_as
+
+    rng = np.random.default_rng(6)
+    maker, image = Maker(ros2=True), "sensor_msgs/msg/Image"
+    colour = rng.integers(0, 255, (5, 4, 6, 3), dtype=np.uint8)
+    depth = rng.uniform(0.5, 4.0, (5, 4, 6)).astype(np.float32)
+    depth[0, 0, :2] = np.nan, 90.0
+    K = np.array([[500.0, 0, 3], [0, 510, 2], [0, 0, 1]])
+    entries: list[Entry] = []
+    for k in range(5):
+        ns = stamp_at(k)
+        entries += [
+            ("/camera/color/image_raw", image, ns, maker.image(ns, colour[k], "rgb8")),
+            ("/camera/depth/image_raw", image, ns, maker.image(ns, np.zeros((2, 2), np.uint16), "16UC1", "other")),
+            ("/camera/aligned_depth_to_color/image_raw", image, ns, maker.image(ns, depth[k], "32FC1")),
+            ("/camera/aligned_depth_to_color/camera_info", "sensor_msgs/msg/CameraInfo", ns, maker.camera(ns, K)),
+        ]
+    bag = store_as("mcap", tmp_path, entries)
+    result = psg(bag, tmp_path / "room", "--to", "rgbd")
+    assert "5 frames as rgbd" in result.stdout
+    assert "distortion" in result.stderr
+    sequence = datasets.read(tmp_path / "room").rgbd_sequence
+    assert sequence is not None
+    np.testing.assert_allclose(sequence.stamps_s, [stamp_at(k) * 1e-9 for k in range(5)], atol=1e-6)
+    assert (sequence.camera.fx_px, sequence.camera.fy_px, sequence.camera.depth_units_per_m) == (500.0, 510.0, 1000.0)
+    from posegraph_slam.mapping.images import read_image
+
+    np.testing.assert_array_equal(read_image(sequence.colour_files[3]), colour[3])
+    stored = read_image(sequence.depth_files[0])
+    assert stored[0, :2].tolist() == [0, 0]
+    np.testing.assert_allclose(stored[1:] / 1000, depth[0, 1:], atol=6e-4)
+    assert psg(bag, tmp_path / "room", "--to", "rgbd", "--overwrite").exit_code == 0
+    assert "no pair of colour and depth" in refused(carmen_log(tmp_path / "a.clf"), tmp_path / "b", "--to", "rgbd")
