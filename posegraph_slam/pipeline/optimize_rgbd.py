@@ -119,6 +119,8 @@ def optimize_rgbd(
         gaps = _first_to_last(stages, tracked.keyframes, views, configuration)
         table, metrics = _compared(stages, log.truth, cells, gaps)
         upward = upward_direction(cells["optimised"], -stages["optimised"].poses[:, :3, 1].mean(axis=0))
+    notes = (*_without_replaced(log.remarks, bool(remarks)), *remarks)
+    warnings = (*tracked.remarks, *_warnings(closed, cloud, settings.cloud))
     return RgbdResult(
         stages=stages,
         odometry=tracked,
@@ -128,15 +130,10 @@ def optimize_rgbd(
         samples=samples,
         upward=upward,
         comparison=table,
-        metrics={**metrics, **_summary(tracked, closed, cloud)},
+        metrics={**metrics, **_summary(tracked, closed, cloud), "remarks": notes, "warnings": warnings},
         stages_s=clock.seconds,
         truth=log.truth,
-        remarks=(
-            *_without_replaced(log.remarks, bool(remarks)),
-            *remarks,
-            *tracked.remarks,
-            *_warnings(closed, cloud, settings.cloud),
-        ),
+        remarks=(*notes, *warnings),
     )
 
 
