@@ -100,7 +100,8 @@ def draw_pictures(objects: list[AlignedObject], out: Path) -> None:
         for pose in found.poses:
             if pose.fit is not None:
                 distance = nearest_distances(pose.points, found.model, pose.T_model_cloud)
-                title = f"{pose.cloud} on {found.task.name}: {1000 * pose.fit.trimmed_rmse_m:.2f} mm trimmed"
+                best, whole = 1000 * pose.fit.trimmed_rmse_m, 1000 * pose.fit.rmse_m
+                title = f"{pose.cloud} on {found.task.name}: RMSE {best:.2f} mm of the best 90 %, {whole:.2f} mm of all"
                 placed = transform_points(pose.T_model_cloud, pose.points)
                 draw_overlay(found.model.points, placed, distance, output_path(out, pose.cloud, ".png"), title=title)
 

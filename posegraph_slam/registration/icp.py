@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray, IntArray, read_only
+from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3
-from posegraph_slam.registration.cloud import Cloud, normals_at, prepare_cloud
+from posegraph_slam.registration.cloud import Cloud, prepare_cloud
 from posegraph_slam.registration.compiled_loop import (
     CONVERGED,
     DEGENERATE,
     MAX_ITERATIONS,
     TOO_FEW_INLIERS,
-    run_loop,
+    describe_end,
+    register,
 )
+from posegraph_slam.registration.pair_search import nothing_known
 from posegraph_slam.registration.pairing import Pairs, Scene, association_for, pair_points, place, rejections_for
 from posegraph_slam.registration.residuals import Residual, residual_for
 from posegraph_slam.registration.result import RegistrationResult, RegistrationStatus
 from posegraph_slam.registration.robust import residual_scale, robust_weights
 from posegraph_slam.registration.settings import IcpSettings, Loss, ResidualKind
-from posegraph_slam.registration.uncertainty import describe_pairs
+from posegraph_slam.registration.surface import Surface
+from posegraph_slam.registration.uncertainty import rmse_of_pairs
 
 DEFAULT_SETTINGS = IcpSettings()
 
@@ -33,11 +35,14 @@ STATUSES = {
     TOO_FEW_INLIERS: RegistrationStatus.TOO_FEW_INLIERS,
     DEGENERATE: RegistrationStatus.DEGENERATE,
 }
-NO_NORMALS, NO_TRUST = read_only(np.zeros((1, 3))), read_only(np.zeros(1))
-NO_NEIGHBOURS = np.zeros((1, 1), dtype=np.int64)
+FAILURES = (RegistrationStatus.TOO_FEW_INLIERS, RegistrationStatus.DEGENERATE)
 
-SPEAKING_PAIRS = 64
-"""Pairs at most, evenly, that describe a point-to-point result: fitting normals to all costs more than the loop."""
+NO_NORMALS = read_only(np.zeros((1, 3)))
+NO_SURFACE = Surface(
+    anchors=NO_NORMALS, normals=NO_NORMALS, oriented=np.zeros(1, dtype=np.bool_), thickness_m=np.zeros(1),
+    trust=np.zeros(1), neighbours=np.zeros((1, 1), dtype=np.int64),
+)  # fmt: skip
+"""Stand for what does not count: it need not be fitted then."""
 
 
 def icp(
@@ -72,16 +77,20 @@ def runs_compiled(settings: IcpSettings) -> bool:
 
 def _run_compiled(source: Cloud, target: Cloud, T: FloatArray, settings: IcpSettings) -> RegistrationResult:
     """Run the loop as one kernel."""
-    d, tree = source.dimension, target.tree
+    d, tree, surface, normals = source.dimension, target.tree, NO_SURFACE, NO_NORMALS
     residual, loss, options = settings.for_kernels
-    shape = _shape_of(target, settings)
-    found, status, iterations, s, t = run_loop(
-        d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value, shape.anchors,
-        shape.normals, shape.trust, _source_normals(source, settings), pose_in_space(T, d), residual, loss,
-        options)  # fmt: skip
-    if status in (TOO_FEW_INLIERS, DEGENERATE):
-        return failed(STATUSES[status], d, pairs=len(s), iterations=iterations)
-    return _described(found, source, target, s, t, settings, STATUSES[status], iterations)
+    if settings.uncertainty or settings.residual is not ResidualKind.POINT_TO_POINT:
+        surface, normals = target.surface, target.normals_in_space
+    pose, code, iterations, pairs, information, free, rmse = register(
+        d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value, surface.anchors,
+        normals, surface.trust, surface.thickness_m, surface.neighbours,
+        _source_normals(source, settings), T, residual, loss, options)  # fmt: skip
+    status = STATUSES[code]
+    if status in FAILURES:
+        return failed(status, d, pairs=pairs, iterations=iterations)
+    return RegistrationResult(T_target_source=pose, status=status, inliers=pairs, inlier_fraction=pairs / len(source),
+                              rmse_m=rmse, information=information, degenerate_directions=free,
+                              iterations=iterations)  # fmt: skip
 
 
 def _run_parts(source: Cloud, target: Cloud, T: FloatArray, settings: IcpSettings) -> RegistrationResult:
@@ -107,22 +116,33 @@ def _run_parts(source: Cloud, target: Cloud, T: FloatArray, settings: IcpSetting
         if lap == power:
             remembered, power, lap = T, 2 * power, 0
     # the last step is below the tolerances, or the loop gave up: either way the last pairs describe the end
-    d = source.dimension
-    found = pose_in_space(T, d)
-    return _described(found, source, target, pairs.source, pairs.target, settings, status, iteration)
+    return _described(source, target, T, pairs, settings, status, iteration)
+
+
+def _described(
+    source: Cloud, target: Cloud, T: FloatArray, pairs: Pairs, settings: IcpSettings, status: RegistrationStatus,
+    iterations: int,
+) -> RegistrationResult:  # fmt: skip
+    """Measure the last pairs at the final pose."""
+    d, tree, surface, normals = source.dimension, target.tree, target.surface, target.normals_in_space
+    residual, loss, options = settings.for_kernels
+    in_space, s, t = pose_in_space(T, d), pairs.source, pairs.target
+    rmse = rmse_of_pairs(d, in_space, source.in_space, target.in_space, normals, surface.trust, surface.anchors,
+                         _source_normals(source, settings), s, t, residual, settings.plane_share)  # fmt: skip
+    p = 3 * (d - 1)
+    information, free = (np.zeros((p, p)), np.eye(p)) if not settings.uncertainty else describe_end(
+        d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value, surface.anchors,
+        normals, surface.trust, surface.thickness_m, surface.neighbours, in_space, s, t, residual, loss,
+        options, *nothing_known(len(source)))  # fmt: skip
+    return RegistrationResult(T_target_source=T, status=status, inliers=len(pairs),
+                              inlier_fraction=len(pairs) / len(source), rmse_m=rmse, information=information,
+                              degenerate_directions=free, iterations=iterations)  # fmt: skip
 
 
 def pose_in_space(T: FloatArray, d: int) -> FloatArray:
     """Pose (4, 4) of points (n, 3) that does to the first d coordinates what T (d+1, d+1) does."""
     result = np.eye(4)
     result[:d, :d], result[:d, 3] = T[:d, :d], T[:d, d]
-    return result
-
-
-def in_plane(T: FloatArray) -> FloatArray:
-    """Pose (3, 3) of the first two coordinates of a pose (4, 4) that turns about the third axis."""
-    result = np.eye(3)
-    result[:2, :2], result[:2, 2] = T[:2, :2], T[:2, 3]
     return result
 
 
@@ -167,27 +187,6 @@ def _checked_pose(T_target_source: FloatArray, source: Cloud, target: Cloud) -> 
     return T
 
 
-class Shape(NamedTuple):
-    """What the kernels know of the target about its points; point-to-point needs no anchors, trust and neighbours."""
-
-    anchors: FloatArray
-    normals: FloatArray
-    trust: FloatArray
-    thickness_m: FloatArray
-    neighbours: IntArray
-
-
-POINTS_ALONE = Shape(NO_NORMALS, NO_NORMALS, NO_TRUST, NO_TRUST, NO_NEIGHBOURS)
-
-
-def _shape_of(target: Cloud, settings: IcpSettings) -> Shape:
-    """Lines or planes of the target, where the residual leans on them."""
-    if settings.residual is ResidualKind.POINT_TO_POINT:
-        return POINTS_ALONE
-    surface = target.surface
-    return Shape(surface.anchors, target.normals_in_space, surface.trust, surface.thickness_m, surface.neighbours)
-
-
 def _source_normals(source: Cloud, settings: IcpSettings) -> FloatArray:
     """Normals of the source where they count, else none: they need not be fitted then."""
     if settings.residual is not ResidualKind.GENERALISED:
@@ -205,30 +204,3 @@ def _weights(residual: Residual, scene: Scene, pairs: Pairs, settings: IcpSettin
         lengths, residual.dimension(scene), settings.translation_tolerance_m
     )
     return trust * robust_weights(settings.loss, lengths, scale)
-
-
-def _described(
-    T: FloatArray, source: Cloud, target: Cloud, s: IntArray, t: IntArray, settings: IcpSettings,
-    status: RegistrationStatus, iterations: int,
-) -> RegistrationResult:  # fmt: skip
-    """Measure the pairs of rows s and t (m,) at the final pose (4, 4)."""
-    d, shape, pairs = source.dimension, _shape_of(target, settings), len(s)
-    if shape is POINTS_ALONE:  # normals only describe the result here: some of the pairs can speak for all
-        step = -(-pairs // SPEAKING_PAIRS)
-        s, t = s[::step].copy(), t[::step].copy()
-        normals, thickness = normals_at(target, t)
-        shape = Shape(NO_NORMALS, normals, NO_TRUST, thickness, NO_NEIGHBOURS)
-    information, free, _, rmse = describe_pairs(
-        d, T, source.in_space, target.in_space, *shape, _source_normals(source, settings), s, t,
-        *settings.for_kernels, len(s) / pairs)  # fmt: skip
-    pose = T if d == 3 else in_plane(T)
-    return RegistrationResult(
-        T_target_source=pose,
-        status=status,
-        inliers=pairs,
-        inlier_fraction=pairs / len(source),
-        rmse_m=rmse,
-        information=information,
-        degenerate_directions=free,
-        iterations=iterations,
-    )

@@ -81,13 +81,16 @@ class IcpSettings(Settings):
     free_sigma_m: float = Field(default=1.0, gt=0)
     """Standard deviation given to directions that the points leave free: the floor under the information."""
 
+    uncertainty: bool = True
+    """Whether information and free directions are worked out; without, zero and all directions come back, sooner."""
+
     @cached_property
     def for_kernels(self) -> tuple[int, int, FloatArray]:
         """Residual and loss as numbers, and the other values in the order that the kernels expect."""
         options = [
             self.max_distance_m, self.keep_fraction, self.loss_scale_m or 0.0, self.max_iterations,
             self.rotation_tolerance_rad, self.translation_tolerance_m, self.min_inliers, self.degeneracy_ratio,
-            self.plane_share, self.sigma_floor_m, self.free_sigma_m, self.min_inlier_fraction,
+            self.plane_share, self.sigma_floor_m, self.free_sigma_m, self.min_inlier_fraction, self.uncertainty,
         ]  # fmt: skip
         return list(ResidualKind).index(self.residual), list(Loss).index(self.loss), read_only(options)
 

@@ -30,12 +30,12 @@ def draw_overlay(model: FloatArray, cloud: FloatArray, distance_m: FloatArray, p
     middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
     reach = 0.53 * float(np.ptp(everything, axis=0).max())
     with matplotlib.style.context("default"):
-        figure = Figure(figsize=(9.0, 4.4), dpi=150, layout="constrained")
+        figure = Figure(figsize=(9.0, 4.0), dpi=150, layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(title)
+        figure.suptitle(title, fontsize=10)
         marks = None
         for axes, (across, name) in zip(figure.subplots(1, 2), ((0, "x"), (1, "y")), strict=True):
-            axes.scatter(model[:, across], model[:, 2], s=1.0, color=GREY, alpha=0.35, linewidths=0, label="model")
+            axes.scatter(model[:, across], model[:, 2], s=1.0, color=GREY, alpha=0.6, linewidths=0, label="model")
             marks = axes.scatter(cloud[:, across], cloud[:, 2], s=1.6, c=distance_mm, vmin=0, vmax=limit,
                                  cmap="viridis", linewidths=0, label="cloud")  # fmt: skip
             axes.set_aspect("equal")

@@ -17,15 +17,23 @@ from posegraph_slam.registration import IcpSettings, RegistrationStatus, icp
 TRIALS = 200
 
 
-@pytest.mark.parametrize(("beams", "sigma_m"), [(181, 0.01), (361, 0.02), (1081, 0.01), (1081, 0.02)])
-def test_information_is_calibrated_in_rooms(beams: int, sigma_m: float, simulated: SimpleNamespace) -> None:
+LINE, POINT, GENERALISED = IcpSettings.point_to_line(), IcpSettings.point_to_point(), IcpSettings.generalised()
+
+
+@pytest.mark.parametrize(("settings", "beams", "sigma_m"), [
+    (LINE, 181, 0.01), (LINE, 361, 0.02), (LINE, 1081, 0.01), (LINE, 1081, 0.03),
+    (POINT, 181, 0.01), (POINT, 361, 0.03), (GENERALISED, 361, 0.02),
+], ids=["line-181", "line-361", "line-1081", "line-noisy", "point-181", "point-361", "generalised"])  # fmt: skip
+def test_information_is_calibrated_in_rooms(
+    settings: IcpSettings, beams: int, sigma_m: float, simulated: SimpleNamespace
+) -> None:
     rng, nees = np.random.default_rng(1), []
     for _ in range(TRIALS):
         at = pose_from_xyt(np.r_[rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3)])
         truth = pose_from_xyt(np.r_[rng.uniform(-0.15, 0.15, 2), rng.uniform(-0.1, 0.1)])
         target = simulated.scan(at, simulated.room, beams, sigma_m, rng)
         source = simulated.scan(at @ truth, simulated.room, beams, sigma_m, rng)
-        result = icp(source, target, truth @ SE2.exp(rng.normal(0, [0.05, 0.05, 0.03])))
+        result = icp(source, target, truth @ SE2.exp(rng.normal(0, [0.05, 0.05, 0.03])), settings)
         assert result.usable
         error = SE2.local(result.T_target_source, truth)
         nees.append(float(error @ result.information @ error))
@@ -89,15 +97,24 @@ def test_more_noise_means_less_information(simulated: SimpleNamespace) -> None:
 
 
 @pytest.mark.data
-def test_information_is_calibrated_on_real_scans(psg_data: Path) -> None:
-    points = read_cloud(psg_data / "clouds" / "lidar_pair" / "target.ply").points
+@pytest.mark.parametrize(("settings", "joined", "sigma_m"), [
+    (GENERALISED, False, 0.01), (IcpSettings(max_distance_m=1.0), True, 0.02),
+], ids=["generalised", "plane"])  # fmt: skip
+def test_information_is_calibrated_on_real_scans(
+    settings: IcpSettings, joined: bool, sigma_m: float, psg_data: Path
+) -> None:
+    folder = psg_data / "clouds" / "lidar_pair"
+    points = read_cloud(folder / "target.ply").points
+    if joined:  # two scans as one scene: where they do not meet it is rough
+        other = read_cloud(folder / "source.ply").points
+        points = np.vstack([points, transform_points(np.loadtxt(folder / "T_target_source.txt"), other)])
     rng, nees = np.random.default_rng(1), []
     for _ in range(TRIALS):
         first, second = np.split(points[rng.permutation(len(points))[:5000]], 2)
         truth = SE3.exp(rng.normal(0, [0.05] * 3 + [0.2] * 3))
         moved = transform_points(SE3.inverse(truth), second)
-        target, source = (p + rng.normal(0, 0.01, p.shape) for p in (first, moved))
-        result = icp(source, target, truth @ SE3.exp(rng.normal(0, [0.02] * 3 + [0.1] * 3)), IcpSettings.generalised())
+        target, source = (p + rng.normal(0, sigma_m, p.shape) for p in (first, moved))
+        result = icp(source, target, truth @ SE3.exp(rng.normal(0, [0.02] * 3 + [0.1] * 3)), settings)
         error = SE3.local(result.T_target_source, truth)
         nees.append(float(error @ result.information @ error))
     low, high = chi2.ppf([0.025, 0.975], 6 * TRIALS) / TRIALS
