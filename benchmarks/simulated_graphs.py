@@ -56,6 +56,26 @@ def torus(rings: int, around: int, sigma_m: float, sigma_rad: float, seed: int) 
                        sigma_rad, np.random.default_rng(seed))  # fmt: skip
 
 
+def cube(side: int, sigma_m: float, sigma_rad: float, seed: int, *, loop_share: float = 0.7) -> PoseGraph:
+    """A path back and forth through a cube of side^3 places 1 m apart, turned at random; loops join neighbours."""
+    rng = np.random.default_rng(seed)
+    z, y, x = np.meshgrid(*[np.arange(side)] * 3, indexing="ij")
+    y = np.where(z % 2 == 0, y, side - 1 - y)
+    x = np.where((z * side + y) % 2 == 0, x, side - 1 - x)
+    place = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    number = np.empty((side,) * 3, np.int64)
+    number[tuple(place.T)] = np.arange(side**3)
+    ends = [(number[:-1], number[1:]), (number[:, :-1], number[:, 1:]), (number[:, :, :-1], number[:, :, 1:])]
+    pairs = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ends])
+    pairs = np.sort(pairs, axis=1)
+    loops = pairs[(pairs[:, 1] - pairs[:, 0] > 1) & (rng.random(len(pairs)) < loop_share)]
+    ahead = np.arange(side**3 - 1)
+    R = SE3.exp(np.concatenate([rng.normal(size=(side**3, 3)), np.zeros((side**3, 3))], axis=1))[:, :3, :3]
+    return noisy_graph(SE3, pose_from_rotation_translation(R, place.astype(float)),
+                       np.concatenate([ahead, loops[:, 0]]), np.concatenate([ahead + 1, loops[:, 1]]),
+                       sigma_m, sigma_rad, rng)  # fmt: skip
+
+
 def streets(count: int, sigma_m: float, sigma_rad: float, seed: int, *, side: int | None = None,
             loop_share: float = 0.5) -> PoseGraph:  # fmt: skip
     """A random drive on a grid of streets of 1 m steps; loops join visits of the same or the next crossing."""
