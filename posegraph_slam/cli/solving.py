@@ -18,7 +18,7 @@ Graph = Annotated[Path, typer.Argument(metavar="GRAPH", help="Pose graph: .g2o, 
 Out = Annotated[Path | None, typer.Option("--out", help="Write the solved graph there (.g2o, .graph or .toro).")]
 NoCertify = Annotated[bool, typer.Option("--no-certify", help="Skip the proof of optimality.")]
 Init = Annotated[str, typer.Option("--init", help="Start: best, given (file), odometry, spanning_tree or chordal.")]
-Method = Annotated[str, typer.Option("--method", help="levenberg_marquardt, gauss_newton or dogleg.")]
+Method = Annotated[str, typer.Option("--method", help="levenberg_marquardt, gauss_newton, dogleg or isam2.")]
 SolverKind = Annotated[str, typer.Option("--solver", help="auto, sparse (our own) or gtsam.")]
 Iterations = Annotated[int, typer.Option("--max-iterations", min=1, help="Accepted steps at most.")]
 Robust = Annotated[

@@ -28,6 +28,8 @@ class SolverMethod(StrEnum):
     LEVENBERG_MARQUARDT = "levenberg_marquardt"
     GAUSS_NEWTON = "gauss_newton"
     DOGLEG = "dogleg"
+    ISAM2 = "isam2"
+    """Nodes added batch by batch from the fixed one on (GTSAM): what an incremental use arrives at."""
 
 
 class EliminationOrdering(StrEnum):
@@ -44,7 +46,7 @@ class SolverSettings(Settings):
 
     kind: SolverKind = Field(default=SolverKind.AUTO, description="auto, gtsam or sparse")
     method: SolverMethod = Field(
-        default=SolverMethod.LEVENBERG_MARQUARDT, description="levenberg_marquardt, gauss_newton or dogleg"
+        default=SolverMethod.LEVENBERG_MARQUARDT, description="levenberg_marquardt, gauss_newton, dogleg or isam2"
     )
     ordering: EliminationOrdering = Field(default=EliminationOrdering.AUTO, description="auto, colamd or metis")
     max_iterations: int = Field(default=100, ge=1, description="accepted steps at most")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from posegraph_slam.errors import GraphError
-from posegraph_slam.pose_graph.graph import PoseGraph
+from posegraph_slam.errors import ConfigurationError, GraphError
+from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
 from posegraph_slam.pose_graph.incremental import IncrementalSolver
 from posegraph_slam.pose_graph.solve import graph_cost, solve
+from posegraph_slam.pose_graph.solver_settings import SolverMethod, SolverSettings
 
 
 def test_growing_ends_at_the_batch_optimum(graph: PoseGraph) -> None:
@@ -36,3 +37,25 @@ def test_what_cannot_be_added_is_named(graph: PoseGraph) -> None:
         solver.add(graph.poses[:3], c.select(np.array([0, 1, 2])))
     with pytest.raises(GraphError, match="row 2"):
         solver.add(graph.poses[:3], c.select(np.array([0])))
+
+
+def test_a_whole_graph_is_solved_batch_by_batch(graph: PoseGraph) -> None:
+    shuffled = np.random.default_rng(0).permutation(len(graph))
+    place = np.argsort(shuffled)
+    c = graph.constraints
+    renamed = Constraints(i=place[c.i], j=place[c.j], T_i_j=c.T_i_j, information=c.information, kind=c.kind)
+    mixed = PoseGraph(poses=graph.poses[shuffled], session=graph.session, index=graph.index,
+                      fixed=graph.fixed[shuffled], constraints=renamed)  # fmt: skip
+    expected = solve(mixed)
+    found = solve(mixed, SolverSettings(method=SolverMethod.ISAM2))
+    assert found.converged
+    assert found.cost == pytest.approx(expected.cost, rel=1e-8)
+    np.testing.assert_array_equal(found.poses[mixed.fixed], mixed.poses[mixed.fixed])
+    assert found.record.cost[0] > found.record.cost[-1]
+
+
+def test_isam2_says_what_it_cannot_do(graph: PoseGraph) -> None:
+    two = PoseGraph(poses=graph.poses, session=graph.session, index=graph.index, fixed=np.arange(len(graph)) < 2,
+                    constraints=graph.constraints)  # fmt: skip
+    with pytest.raises(ConfigurationError, match="one fixed node and no loss"):
+        solve(two, SolverSettings(method=SolverMethod.ISAM2))
