@@ -18,7 +18,7 @@ def read_graph(path: Path | str) -> PoseGraph:
             tag = next((w[0] for w in words if w and not w[0].startswith("#")), "")
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "give a pose-graph text file") from None
-    return toro.read_toro(path) if tag in toro.FORMATS else g2o.read_g2o(path)
+    return toro.read_toro(path) if tag in toro.TORO.records else g2o.read_g2o(path)
 
 
 def write_graph(graph: PoseGraph, path: Path | str) -> None:
