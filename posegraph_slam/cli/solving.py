@@ -79,8 +79,8 @@ def solve(
     --out, --edges and --plot write files; nothing else is written.
     """
     from posegraph_slam.cli.graph_requests import covariances, edited, optimum_settings
-    from posegraph_slam.pose_graph.files import read_graph, write_graph
-    from posegraph_slam.pose_graph.optimum import find_optimum, write_edges
+    from posegraph_slam.pose_graph.files import check_graph_name, read_graph
+    from posegraph_slam.pose_graph.optimum import find_optimum
     from posegraph_slam.pose_graph.warmup import load_kernels
 
     settings = optimum_settings(
@@ -88,6 +88,8 @@ def solve(
          "solver": {"method": method, "kind": solver, "max_iterations": max_iterations},
          "outliers": {"method": robust, "parameter": robust_parameter}}
     )  # fmt: skip
+    if out is not None:
+        check_graph_name(out)
     load_kernels(graph)  # so that the times reported are those of the graph
     began = time.perf_counter()
     whole = read_graph(graph)
@@ -100,22 +102,31 @@ def solve(
             print_note(note)
     with ProgressBars(enabled=not quiet and not as_json) as progress:
         optimum = find_optimum(problem, settings, progress=progress)
+    seconds = {"read": read_s, **optimum.seconds, "write": write_files(optimum, out, edges)}
+    asked = covariances(optimum, marginal or [], relative or [])
+    if plot is not None:
+        draw(optimum, plot, graph.name)
+    report = summary(graph, optimum, seconds, notes)
+    if as_json:
+        print_json(report | asked)
+    elif not quiet:
+        print_summary(report, optimum)
+        print_covariances(asked)
+    if not optimum.result.converged:
+        print_warning(f"no optimum was reached: {optimum.stop_reason}")
+
+
+def write_files(optimum: Optimum, out: Path | None, edges: Path | None) -> float:
+    """Write the graph and the table of its edges where asked for; return the seconds that took."""
+    from posegraph_slam.pose_graph.files import write_graph
+    from posegraph_slam.pose_graph.optimum import write_edges
+
     began = time.perf_counter()
     if out is not None:
         write_graph(optimum.kept_graph, out)
     if edges is not None:
         write_edges(optimum, edges)
-    seconds = {"read": read_s, **optimum.seconds, "write": time.perf_counter() - began}
-    asked = covariances(optimum, marginal or [], relative or [])
-    if plot is not None:
-        draw(optimum, plot, graph.name)
-    if as_json:
-        print_json(summary(graph, optimum, seconds, notes) | asked)
-    elif not quiet:
-        print_summary(summary(graph, optimum, seconds, notes), optimum)
-        print_covariances(asked)
-    if not optimum.result.converged:
-        print_warning(f"no optimum was reached: {optimum.stop_reason}")
+    return time.perf_counter() - began
 
 
 def draw(optimum: Optimum, path: Path, name: str) -> None:

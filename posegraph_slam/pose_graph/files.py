@@ -21,12 +21,17 @@ def read_graph(path: Path | str) -> PoseGraph:
     return toro.read_toro(path) if tag in toro.TORO.records else g2o.read_g2o(path)
 
 
+def check_graph_name(path: Path | str) -> str:
+    """Return the suffix of a file to be written, or raise `InputError` if it names no known format."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".g2o", ".graph", ".toro"):
+        raise InputError(path, f"unknown kind of pose-graph file {suffix!r}", "name it .g2o, .graph or .toro")
+    return suffix
+
+
 def write_graph(graph: PoseGraph, path: Path | str) -> None:
     """Write a g2o (.g2o) or TORO (.graph, .toro) file."""
-    suffix = Path(path).suffix.lower()
-    if suffix == ".g2o":
+    if check_graph_name(path) == ".g2o":
         g2o.write_g2o(graph, path)
-    elif suffix in (".graph", ".toro"):
-        toro.write_toro(graph, path)
     else:
-        raise InputError(path, f"unknown kind of pose-graph file {suffix!r}", "name it .g2o, .graph or .toro")
+        toro.write_toro(graph, path)

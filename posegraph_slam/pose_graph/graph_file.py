@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import InputError
+from posegraph_slam.files import replacing
 from posegraph_slam.geometry import SE2, SE3, Group
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
 from posegraph_slam.pose_graph.graph_text import Records
@@ -39,8 +38,9 @@ def assemble_graph(
     """Build the graph of a file from its records and their poses.
 
     Nodes stand in the order of their vertex records, then those that only edges name, by id; the latter get poses by
-    composing edges. Edges between successive ids are `ODOMETRY`, others `EXTERNAL`. Without fixed ids the first node
-    is fixed. Raises `InputError` with file and line for a vertex given twice, a self edge or an unknown fixed id.
+    composing edges. Edges between ids of a session that follow each other are `ODOMETRY`, others `EXTERNAL`. Without
+    fixed ids the first node is fixed. Raises `InputError` with file and line for a vertex given twice, a self edge or an
+    unknown fixed id.
     """
     vertex_ids, ends = vertices[0].ids[:, 0], edges[0].ids
     _check_vertices(path, vertices[0])
@@ -53,7 +53,8 @@ def assemble_graph(
         raise InputError(
             f"{path}:{fixed.lines[unknown[0]]}", f"FIX names node {fixed.ids[unknown[0], 0]}, which is not there"
         )
-    odometry = np.abs(ends[:, 1] - ends[:, 0]) == 1
+    rank = np.argsort(np.argsort(ids))[ends_rows]
+    odometry = (np.abs(rank[:, 1] - rank[:, 0]) == 1) & (ends[:, 0] >> SESSION_BITS == ends[:, 1] >> SESSION_BITS)
     constraints = Constraints(
         i=ends_rows[:, 0],
         j=ends_rows[:, 1],
@@ -117,13 +118,9 @@ def _places(group: Group) -> tuple[IntArray, IntArray]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that appears complete or not at all."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    """Write a file that appears complete or not at all; `InputError` where that is not possible."""
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)  # mkstemp keeps others out
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise InputError(path, f"cannot be written ({error.strerror})", "give another place") from None

@@ -70,8 +70,8 @@ class GraphFormat:
 def read_graph_text(path: Path | str, layout: GraphFormat) -> PoseGraph:
     """Read a file; nodes stand in the order of their vertex lines, then those that only edges name, by id.
 
-    Edges between successive ids are `ODOMETRY`, others `EXTERNAL`. Vertices that are missing get poses from the edges;
-    if none is fixed, the first is. Raises `InputError` with file and line for anything not understood.
+    Edges between ids that follow each other are `ODOMETRY`, others `EXTERNAL`. Vertices that are missing get poses from
+    the edges; if none is fixed, the first is. Raises `InputError` with file and line for anything not understood.
     """
     path = Path(path)
     records = read_records(path, layout.records)

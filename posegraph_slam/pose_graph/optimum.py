@@ -21,7 +21,7 @@ from posegraph_slam.pose_graph.graph_file import node_ids, write_text
 from posegraph_slam.pose_graph.linearization import chi2_at
 from posegraph_slam.pose_graph.outliers import Classified, OutlierMethod, OutlierSettings, classify_loops, loop_weights
 from posegraph_slam.pose_graph.solve import graph_cost, solve
-from posegraph_slam.pose_graph.solver_settings import SolveResult, SolverSettings
+from posegraph_slam.pose_graph.solver_settings import SolveResult, SolverSettings, StopReason
 from posegraph_slam.pose_graph.starts import Start, starting_poses
 from posegraph_slam.settings import Settings
 
@@ -69,8 +69,11 @@ class Optimum:
 
     @property
     def stop_reason(self) -> str:
-        """Why the last solver stopped."""
-        return self.result.stop_reason.value
+        """Why the last solver stopped; `already_optimal` only where the graph as given was."""
+        reason = self.result.stop_reason
+        if reason is StopReason.ALREADY_OPTIMAL and self.error < self.error_initial * (1 - SAME_COST):
+            reason = StopReason.CONVERGED
+        return reason.value
 
     @property
     def kept_graph(self) -> PoseGraph:

@@ -47,7 +47,7 @@ def test_a_small_file_is_read_as_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(c.information[0], [[1, 0.2, 0], [0.2, 3, 0.5], [0, 0.5, 7]])
     np.testing.assert_allclose(c.T_i_j[3], [[0, -1, 1.1], [1, 0, 0], [0, 0, 1]], atol=1e-15)
     external, odometry = int(ConstraintKind.EXTERNAL), int(ConstraintKind.ODOMETRY)
-    assert c.kind.tolist() == [external, external, external, odometry]
+    assert c.kind.tolist() == [external, odometry, external, odometry]
 
 
 def test_the_first_node_is_fixed_by_default_and_missing_vertices_come_from_edges(tmp_path: Path) -> None:
