@@ -39,8 +39,8 @@ def assemble_graph(
 
     Nodes stand in the order of their vertex records, then those that only edges name, by id; the latter get poses by
     composing edges. Edges between ids of a session that follow each other are `ODOMETRY`, others `EXTERNAL`. Without
-    fixed ids the first node is fixed. Raises `InputError` with file and line for a vertex given twice, a self edge or an
-    unknown fixed id.
+    fixed ids the first node is fixed. Raises `InputError` with file and line for a vertex given twice, a self edge or
+    an unknown fixed id.
     """
     vertex_ids, ends = vertices[0].ids[:, 0], edges[0].ids
     _check_vertices(path, vertices[0])
