@@ -99,3 +99,9 @@ def test_every_reader_has_a_page_and_the_citation_the_version() -> None:
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert f"version: {posegraph_slam.__version__}" in citation
     assert "cff-version: 1.2.0" in citation
+
+
+def test_every_page_is_listed() -> None:
+    listing = (DOCS / "README.md").read_text(encoding="utf-8")
+    pages = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")} - {"README.md"}
+    assert not {page for page in pages if f"]({page}" not in listing}
