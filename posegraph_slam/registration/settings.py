@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import StrEnum
 from functools import cached_property
+from typing import Any, Self
 
 from pydantic import Field
 
@@ -93,6 +95,12 @@ class IcpSettings(Settings):
             self.plane_share, self.sigma_floor_m, self.free_sigma_m, self.min_inlier_fraction, self.uncertainty,
         ]  # fmt: skip
         return list(ResidualKind).index(self.residual), list(Loss).index(self.loss), read_only(options)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Copy the settings with some of them changed; what was worked out for the kernels is not taken along."""
+        copy = super().model_copy(update=update, deep=deep)
+        copy.__dict__.pop("for_kernels", None)
+        return copy
 
     @classmethod
     def point_to_point(cls) -> IcpSettings:

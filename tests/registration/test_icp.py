@@ -275,3 +275,10 @@ def test_the_pose_alone_is_the_same_pose(
     assert (alone.status, alone.rmse_m) == (whole.status, whole.rmse_m)
     assert not alone.information.any()
     assert len(alone.degenerate_directions) == group.dof
+
+
+def test_copied_settings_are_not_those_of_before() -> None:
+    settings = IcpSettings()
+    assert settings.for_kernels[2][0] == 0.5
+    assert settings.model_copy(update={"max_distance_m": 0.2}).for_kernels[2][0] == 0.2
+    assert settings.for_kernels[2][0] == 0.5
