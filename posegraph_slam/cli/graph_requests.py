@@ -26,7 +26,7 @@ from posegraph_slam.pose_graph.noise import information_from_sigmas
 from posegraph_slam.pose_graph.optimum import Optimum, OptimumSettings
 
 KINDS = {"odometry": ConstraintKind.ODOMETRY, "external": ConstraintKind.EXTERNAL, "loops": ConstraintKind.EXTERNAL}
-"""Kinds that a graph file can hold: edges between successive ids, and all others."""
+"""Kinds that a graph file can hold: edges between ids that follow each other, and all others."""
 
 
 OPTIONS = {

@@ -9,11 +9,12 @@ from posegraph_slam.pose_graph.files import read_graph
 from posegraph_slam.pose_graph.optimum import OptimumSettings, find_optimum
 
 PLANAR = """VERTEX_SE2 {0} {0} 0 0
-EDGE_SE2 {0} {1} 1 0 0.1 1 0 0 1 0 1
+EDGE_SE2 {0} {1} 1 0 1.25 1 0 0 1 0 1
 """
 SPATIAL = """VERTEX_SE3:QUAT {0} {0} 0 0 0 0 0 1
-EDGE_SE3:QUAT {0} {1} 1 0 0 0.1 0 0 0.995 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1
+EDGE_SE3:QUAT {0} {1} 1 0 0 0 0 0.585 0.811 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1
 """
+"""Steps around a pentagon that nearly closes."""
 
 
 def load_kernels(path: Path | str) -> None:

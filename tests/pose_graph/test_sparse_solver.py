@@ -12,7 +12,7 @@ from posegraph_slam.geometry import SE3, Group
 from posegraph_slam.pose_graph.block_cholesky import factorize
 from posegraph_slam.pose_graph.block_pattern import block_pattern
 from posegraph_slam.pose_graph.block_substitution import solve_factored, solve_many
-from posegraph_slam.pose_graph.elimination import analyze, minimum_degree
+from posegraph_slam.pose_graph.elimination import analyze, elimination_work, minimum_degree, nested_dissection
 from posegraph_slam.pose_graph.graph import Constraints, PoseGraph
 from posegraph_slam.pose_graph.linearization import chi2_at, moved_poses, normal_equations, residuals_at
 from posegraph_slam.pose_graph.residuals import chi2, constraint_jacobians, constraint_residuals
@@ -113,6 +113,20 @@ def test_the_analysis_is_a_permutation_with_postordered_supernodes(count: int, e
         assert np.all(rows >= tree.start[node + 1])
 
 
+def test_nested_dissection_orders_every_node_and_saves_work_on_a_cube() -> None:
+    side = 9
+    number = np.arange(side**3).reshape(side, side, side)
+    ends = [(number[:-1], number[1:]), (number[:, :-1], number[:, 1:]), (number[:, :, :-1], number[:, :, 1:])]
+    i, j = (np.concatenate([pair[k].ravel() for pair in ends]) for k in range(2))
+    count = side**3 + 2  # two nodes without any edge
+    orders = minimum_degree(count, i, j), nested_dissection(count, i, j)
+    for order in orders:
+        assert sorted(order.tolist()) == list(range(count))
+    assert elimination_work(count, i, j, orders[1]) < elimination_work(count, i, j, np.arange(count))
+    dense_work = elimination_work(count, i, j, np.argsort(np.random.default_rng(0).random(count)))
+    assert elimination_work(count, i, j, orders[1]) < 0.5 * dense_work
+
+
 @pytest.mark.parametrize("scale", [1e-9, 1e-5, 1e-3, 0.09, 0.11, 0.5, 1.2])
 def test_compiled_residuals_match_the_formulas_on_arrays(group: Group, graph_maker: Maker, scale: float) -> None:
     noisy = disturbed(graph_maker(group, noise=0.0), scale)
@@ -171,6 +185,14 @@ def test_both_solvers_find_the_same_optimum(graph: PoseGraph, loss: RobustLoss) 
     assert ours.cost == pytest.approx(theirs.cost, rel=1e-8)
     np.testing.assert_allclose(ours.weights, theirs.weights, atol=1e-3)
     np.testing.assert_allclose(ours.record.cost[:4], theirs.record.cost[:4], rtol=1e-6)  # the same walk
+
+
+def test_the_last_step_reuses_the_factor_and_reaches_the_optimum(graph: PoseGraph) -> None:
+    run = solve(graph, SolverSettings(kind=SolverKind.SPARSE))
+    tight = solve(graph.with_poses(run.poses), SolverSettings(kind=SolverKind.GTSAM, relative_tolerance=1e-14))
+    assert run.record.cost[-1] == pytest.approx(run.cost, rel=1e-12)
+    assert np.all(np.diff(run.record.cost) <= 0)
+    assert run.cost == pytest.approx(tight.cost, rel=1e-10)
 
 
 def test_dogleg_is_gtsams(graph: PoseGraph) -> None:
