@@ -37,8 +37,8 @@ RESULT = Path(__file__).parent / "results" / "rgbd.json"
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 BEGIN, END = "<!-- rgbd: begin -->", "<!-- rgbd: end -->"
 FIVE_FRAMES = {"fx_px": 518.0, "fy_px": 519.0, "cx_px": 325.5, "cy_px": 253.5}
-ROOM_FRAMES, ROOM_TURNS = 240, 1.1
-SPEED_FRAMES = 60
+ROOM_FRAMES, ROOM_TURNS = 120, 1.1
+SPEED_FRAMES = 40
 """Frames on which the speed of odometry is measured."""
 
 
@@ -167,6 +167,17 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def save(results: dict[str, Any]) -> None:
+    """Write the results so far, and their table into the page."""
+    text = table(results)
+    with replacing(RESULT) as part:
+        part.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
+    if BEGIN in page and END in page:
+        before, after = page.split(BEGIN)[0], page.split(END)[1]
+        PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+
+
 def main() -> int:
     """Measure all logs that are there; write the results and the table."""
     o3d, results = open3d_module(), {}
@@ -176,21 +187,17 @@ def main() -> int:
         poses = loop_through_room(ROOM_FRAMES, turns=ROOM_TURNS)
         write_rgbd_log(room, furnished_room(seed=3), small_camera(320, 240), poses)
         results["simulated room"] = measure(read(room), load_configuration([], base), o3d)
+    save(results)
     data = Path(os.environ["PSG_DATA"]) / "rgbd" if os.environ.get("PSG_DATA") else None
     if data is None:
         print("the real logs are left out: set PSG_DATA to their folder")
     else:
         results["living_room"] = measure(read(data / "living_room"), load_configuration([], base), o3d)
+        save(results)
         camera = [f"rgbd.camera.{name}={value}" for name, value in FIVE_FRAMES.items()]
         results["five_frames"] = measure(read(data / "five_frames"), load_configuration([], [*base, *camera]), o3d)
-    text = table(results)
-    print(text)
-    with replacing(RESULT) as part:
-        part.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    page = PAGE.read_text(encoding="utf-8")
-    if BEGIN in page and END in page:
-        before, after = page.split(BEGIN)[0], page.split(END)[1]
-        PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+    save(results)
+    print(table(results))
     return 0
 
 

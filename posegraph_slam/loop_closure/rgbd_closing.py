@@ -34,6 +34,8 @@ SUPPORT = VerificationSettings(consistency_m=0.3, consistency_rad=0.1)
 """Two closures support each other when the loop through both closes this well."""
 KEYFRAME_M = 0.3
 """Travel counted for a keyframe where support is looked for: closures two keyframes apart are two witnesses."""
+STILL_M, STILL_RAD = 0.03, 0.01
+"""Rounds end when closures no longer move a keyframe by more than this."""
 
 
 class RgbdLoopSettings(Settings):
@@ -103,7 +105,7 @@ def close_rgbd_loops(
     """Add loop closures to the chain of keyframes `graph` (K nodes, map -> camera) with their `views` (K).
 
     Each round tries pairs that were not tried before, aligns them, and solves the graph with those that pass; what
-    disagrees with the solved graph is taken out again. Rounds end when nothing new is found.
+    disagrees with the solved graph is taken out again. Rounds end when nothing new is found or nothing moves.
     """
     executor = executor or SerialExecutor()
     chain, ledger = graph.constraints, Ledger()
@@ -118,11 +120,15 @@ def close_rgbd_loops(
         made = round_ + 1
         findings = executor.map(partial(_align, views=views, settings=settings, seed=seed), trials)
         found = _verify(graph, trials, findings, round_, ledger, settings)
+        before = graph.poses
         if len(found):
             closures = Constraints.concatenate([closures, found])
             graph, sigmas, kept = settle(graph, chain, closures, solver, settings.sigma_max)
             ledger.settle(sigmas, kept)
             closures = closures.select(kept)
+        moved = SE3.local(before, graph.poses)
+        if np.abs(moved[:, 3:]).max() < STILL_M and np.abs(moved[:, :3]).max() < STILL_RAD:
+            break  # the views overlap as they did before: the same pairs would be proposed
     graph = graph.with_constraints(Constraints.concatenate([chain, closures]))
     solution = solve(graph, solver)
     progress("loop closure", rounds, rounds)
