@@ -58,11 +58,12 @@ def open3d_path(o3d: Any, sequence: RgbdSequence) -> FloatArray:
     intrinsic = o3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx_px, c.fy_px, c.cx_px, c.cy_px)
     option = o3d.pipelines.odometry.OdometryOption()
     option.depth_max = 10.0
-    jacobian = o3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm()
+    jacobian, images = o3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm(), FrameImages(sequence=sequence)
 
     def image(k: int) -> Any:
+        colour, depth = images(k)  # Open3D itself reads no PGM
         return o3d.geometry.RGBDImage.create_from_color_and_depth(
-            o3d.io.read_image(str(sequence.colour_files[k])), o3d.io.read_image(str(sequence.depth_files[k])),
+            o3d.geometry.Image(colour), o3d.geometry.Image(np.array(depth)),
             depth_scale=c.depth_units_per_m, depth_trunc=10.0, convert_rgb_to_intensity=True,
         )  # fmt: skip
 
