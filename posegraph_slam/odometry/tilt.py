@@ -12,12 +12,13 @@ from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SO3, Trajectory, interpolate, pose_from_rotation_translation
 from posegraph_slam.odometry.attitude import AttitudeEstimate, AttitudeSettings, estimate_attitude
-from posegraph_slam.odometry.attitude.start import still_samples
 from posegraph_slam.sensors import STANDARD_GRAVITY, Imu, WheelEncoders
 from posegraph_slam.settings import Settings
 
 GRID_S = 0.01
 MIN_LEVEL_SAMPLES = 20
+START_MARGIN_S = 0.2
+"""Motion below one tick begins about this much before the first."""
 
 
 class TiltSettings(Settings):
@@ -89,9 +90,9 @@ def estimate_tilt(encoders: WheelEncoders, imu: Imu, settings: TiltSettings) -> 
     """
     R_base_imu = imu.T_base_imu[:3, :3]
     omega, accel = imu.angular_velocity @ R_base_imu.T, imu.linear_acceleration @ R_base_imu.T
-    count = still_samples(imu.stamps_s, omega, accel, settings.attitude)
+    count = _before_the_wheels_roll(encoders, imu)
     offset, remark = _level_offset(accel[:count], settings)
-    bias = omega[:count].mean(axis=0) if count >= MIN_LEVEL_SAMPLES else np.zeros(3)
+    bias = np.median(omega[:count], axis=0) if count >= MIN_LEVEL_SAMPLES else np.zeros(3)
     accel = accel - offset
     if settings.wheel_acceleration:
         accel = accel - motion_acceleration(encoders, imu.stamps_s, omega - bias, settings.wheel_smoothing_s)
@@ -123,13 +124,20 @@ def motion_acceleration(
     return np.stack([a, v * omega[:, 2], -v * omega[:, 1]], axis=1)
 
 
+def _before_the_wheels_roll(encoders: WheelEncoders, imu: Imu) -> int:
+    """Count the samples before the first tick, a margin cut off: to an IMU an even acceleration looks like a stop."""
+    ticks = np.concatenate([encoders.ticks_left, encoders.ticks_right], axis=1)[1:].any(axis=1)
+    rolling = encoders.stamps_s[int(np.argmax(ticks))] if ticks.any() else np.inf
+    return int(np.searchsorted(imu.stamps_s, rolling - START_MARGIN_S))
+
+
 def _level_offset(accel: FloatArray, settings: TiltSettings) -> tuple[FloatArray, str]:
     """What a still accelerometer (n, 3) shows beside gravity on level ground, and a remark on it."""
     if not settings.level_start:
         return np.zeros(3), ""
     if len(accel) < MIN_LEVEL_SAMPLES:
         return np.zeros(3), "the robot moves from the start: the accelerometer's own tilt is not known"
-    mean = accel.mean(axis=0)
+    mean = np.median(accel, axis=0)
     tilt = float(np.arctan2(np.hypot(mean[0], mean[1]), mean[2]))
     if tilt > settings.level_start_max_rad:
         return np.zeros(3), f"the log begins at a tilt of {np.degrees(tilt):.1f} deg, which is taken for a slope"

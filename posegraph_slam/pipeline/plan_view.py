@@ -23,8 +23,6 @@ from posegraph_slam.sensors import LaserScans, RobotLog
 
 WHEELS = ("wheels", "wheels_imu")
 """Sources of odometry that is known at the scans' own stamps."""
-SEARCH_REACH = ("search_reach_m", "search_reach_rad")
-"""In space the scan matching searches no further than wheels and gyro can be wrong."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,8 +51,9 @@ class PlanView:
         spatial = spatial_odometry_at_scans(log, configuration.odometry, configuration.spatial.odometry)
         level = level_laser(scans, spatial, configuration.spatial.levelling)
         matching = configuration.scan_matching
-        reach = {name: min(getattr(matching, name), getattr(configuration.spatial, name)) for name in SEARCH_REACH}
-        configuration = configuration.model_copy(update={"scan_matching": matching.model_copy(update=reach)})
+        if not configuration.spatial.search:
+            trusting = matching.model_copy(update={"matched_fraction_min": 0.0})
+            configuration = configuration.model_copy(update={"scan_matching": trusting})
         return PlanView(
             scans=level.scans,
             odometry=spatial.planar,

@@ -28,10 +28,9 @@ class SpatialSettings(Settings):
 
     odometry: SpatialOdometrySettings = SpatialOdometrySettings()
     levelling: LevellingSettings = LevellingSettings()
-    search_reach_m: float = Field(default=0.3, gt=0)
-    """Wheels and gyro know each step to within this: scan matching searches no further where few points match,"""
-    search_reach_rad: float = Field(default=0.3, gt=0)
-    """nor turns further. On a ramp little but the side walls is left to match, and those slide along themselves."""
+    search: bool = False
+    """Whether scan matching searches a window where few points match. On a ramp little but the side walls is left,
+    along which a scan slides, and wheels and gyro know each step better; wheels that slip for metres need it."""
     tilt_sigma_min_rad: float = Field(default=0.004, gt=0)
     """Roll and pitch of a keyframe are not known better than this, whatever the filter says."""
     same_ground_m: float = Field(default=0.6, ge=0)

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from posegraph_slam.datasets.simulation import ImuSettings, LidarSettings, drive, ramp_settings
+from posegraph_slam.datasets.simulation import DriveSettings, ImuSettings, LidarSettings, drive, ramp_settings
 from posegraph_slam.errors import InputError
 from posegraph_slam.evaluation.attitude import euler_rpy
 from posegraph_slam.geometry import Trajectory, inverse_pose
@@ -51,6 +51,18 @@ def test_acceleration_of_the_wheels_and_the_level_start_both_help():
     )
     assert best < 0.6 * plain
     assert best < 0.4 * tilted
+
+
+def test_a_start_at_an_even_acceleration_is_not_taken_for_a_tilt():
+    log = drive(ramp_settings(seed=11, lidar=LIDAR, drive=DriveSettings(still_s=0.0)))
+    errors = tilt_errors(log, TiltSettings())
+    assert np.sqrt((errors**2).mean()) < 0.6
+
+
+def test_a_noisy_accelerometer_still_shows_its_bias_at_the_start():
+    noisy = ImuSettings(sigma_accelerometer_g=0.05, sigma_accelerometer_bias_g=0.02, sigma_gyro_rad_s=0.02)
+    log = drive(ramp_settings(seed=4, lidar=LIDAR, imu=noisy))
+    assert np.sqrt((tilt_errors(log, TiltSettings()) ** 2).mean()) < 0.4
 
 
 def test_sigma_of_the_tilt_covers_its_error(log, odometry):
