@@ -57,7 +57,7 @@ class HitMapSettings(Settings):
     """First window, about the odometry pose."""
     fine: WindowSettings = WindowSettings(reach_m=0.05, step_m=0.025, reach_rad=DEGREE, step_rad=0.25 * DEGREE)
     """Second window, about the best pose of the first."""
-    prior_weight: float = Field(default=0.05, ge=0)
+    prior_weight: float = Field(default=0.2, ge=0)
     """Height of the Gaussian prior about the odometry pose, as a share of the best count in the window."""
 
     @model_validator(mode="after")
