@@ -144,8 +144,20 @@ def shifted(poses: FloatArray, share: float) -> FloatArray:
 
 
 def without_lag(odometry: OdometryEstimate, lag: float) -> OdometryEstimate:
-    """Return the odometry at the time of the scans, when it lags behind them by `lag` scan intervals."""
-    return replace(odometry, trajectory=odometry.trajectory.with_poses(shifted(odometry.trajectory.poses, lag)))
+    """Return the odometry at the time of the scans, when it lags behind them by `lag` scan intervals.
+
+    A step then consists of parts of two, and takes the covariance of the less certain one: a leap is in both.
+    """
+    if lag == 0.0:
+        return odometry
+    covariance = odometry.covariance
+    beside = np.roll(covariance, -1 if lag > 0 else 1, axis=0)
+    unsure = np.trace(beside, axis1=1, axis2=2) > np.trace(covariance, axis1=1, axis2=2)
+    return replace(
+        odometry,
+        trajectory=odometry.trajectory.with_poses(shifted(odometry.trajectory.poses, lag)),
+        covariance=np.where(unsure[:, None, None], beside, covariance),
+    )
 
 
 def _steps(poses: FloatArray) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -112,6 +114,17 @@ def test_the_lag_of_odometry_is_found_and_taken_away(late: float) -> None:
 
     corrected = without_lag(odometry, found.share).trajectory.poses
     assert wrong_turn(corrected) < 0.7 * wrong_turn(odometry.trajectory.poses)
+
+
+@pytest.mark.parametrize("lag", [0.4, -0.6])
+def test_both_parts_of_a_shifted_leap_are_unsure(lag: float) -> None:
+    odometry = odometry_of(30)
+    covariance = odometry.covariance.copy()
+    covariance[12] *= 1e4
+    leaping = replace(odometry, covariance=covariance)
+    unsure = np.flatnonzero(without_lag(leaping, lag).covariance[:, 2, 2] > 1e-3)
+    assert unsure.tolist() == ([11, 12] if lag > 0 else [12, 13])
+    assert without_lag(leaping, 0.0) is leaping
 
 
 def test_a_log_without_odometry_or_motion_shows_nothing() -> None:
