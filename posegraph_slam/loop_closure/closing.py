@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,6 +54,29 @@ class LoopClosureResult:
     records: tuple[LoopRecord, ...]
     rounds: int
     solution: SolveResult
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts of the candidates, in all and by kind, and how the solver fared."""
+        proposed = Counter(record.kind for record in self.records)
+        accepted = Counter(record.kind for record in self.records if record.accepted)
+        return {
+            "loops_proposed": proposed.total(),
+            "loops_accepted": accepted.total(),
+            "loops_by_kind": {
+                kind: {"proposed": proposed[kind], "accepted": accepted[kind]} for kind in sorted(proposed)
+            },
+            "loop_rounds": self.rounds,
+            "graph_cost_initial": self.solution.cost_initial,
+            "graph_cost": self.solution.cost,
+            "solver_stop_reason": str(self.solution.stop_reason),
+        }
+
+    def warnings(self) -> list[str]:
+        """Return what a user should look at in the solution, in plain sentences."""
+        notes = list(self.solution.notes)
+        if not self.solution.converged:
+            notes.append(f"the pose graph did not converge: {self.solution.stop_reason}")
+        return notes
 
 
 def close_loops(

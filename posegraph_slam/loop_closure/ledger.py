@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,6 +39,12 @@ class LoopRecord:
     sigmas_after: float
     accepted: bool
     reason: str
+
+
+def rejected_pairs(records: Sequence[LoopRecord]) -> IntArray:
+    """Return target and source keyframe (R, 2) of the candidates that were rejected."""
+    pairs = [(record.target, record.source) for record in records if not record.accepted]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 @dataclass(slots=True)

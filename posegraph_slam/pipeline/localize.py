@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from posegraph_slam.odometry.scan_matching import match_scans
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.optimize import usable_scans
-from posegraph_slam.pipeline.recording import Report, RunOutcome, recorded_run
+from posegraph_slam.pipeline.recording import RunOptions, RunOutcome, recorded_run
 from posegraph_slam.pipeline.run_directory import METRICS, RunDirectory
 from posegraph_slam.pipeline.run_record import fingerprint
 from posegraph_slam.registration.beam_scans import BeamScans, prepare_beam_scans
@@ -64,29 +63,15 @@ def run_localization(
     log_path: Path,
     configuration: Configuration,
     *,
-    out: Path,
     start: FloatArray | None = None,
-    overwrite: bool = False,
-    log_format: str | None = None,
-    topics: Mapping[str, str] | None = None,
-    report: Report | None = None,
     progress: Progress = silent_progress,
-    command: Sequence[str] | None = None,
+    **options: Unpack[RunOptions],
 ) -> RunOutcome:
     """Localise the log at `log_path` in the nav2 map at `map_path` and leave the result in the run directory `out`.
 
     Raises InputError where `out` is taken, or map or log cannot be used; nothing is then left.
     """
-    with recorded_run(
-        log_path,
-        configuration,
-        out=out,
-        overwrite=overwrite,
-        log_format=log_format,
-        topics=topics,
-        report=report,
-        command=command,
-    ) as run:
+    with recorded_run(log_path, configuration, **options) as run:
         with run.clock.stage("reading"):
             grid = read_nav2(map_path)
             run.inputs["map"] = fingerprint(map_path)
@@ -96,7 +81,7 @@ def run_localization(
         with run.clock.stage("saving"):
             save_localization(result, run.directory)
             run.directory.write_json(METRICS, metrics)
-    return RunOutcome(folder=out, metrics=metrics, record=run.record, remarks=remarks)
+    return RunOutcome(folder=run.folder, metrics=metrics, record=run.record, remarks=remarks)
 
 
 def save_localization(result: LocalizationResult, directory: RunDirectory) -> None:

@@ -16,7 +16,7 @@ from posegraph_slam.evaluation.tables import ComparisonRow, ComparisonTable
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
 from posegraph_slam.geometry import SE3, Trajectory, deform
 from posegraph_slam.loop_closure.closing import LoopClosureResult
-from posegraph_slam.loop_closure.ledger import LoopRecord
+from posegraph_slam.loop_closure.ledger import LoopRecord, rejected_pairs
 from posegraph_slam.loop_closure.rgbd_closing import close_rgbd_loops
 from posegraph_slam.loop_closure.rgbd_views import KeyframeViews
 from posegraph_slam.mapping.colour_cloud import ColourCloud, ColourCloudSettings, fuse_cloud
@@ -25,7 +25,7 @@ from posegraph_slam.odometry.rgbd_odometry import RgbdOdometry, track_rgbd
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.rgbd_frames import FrameImages, PreparedFrames, chosen_camera
-from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
+from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
 from posegraph_slam.pose_graph.solve import solve
 from posegraph_slam.registration.rgbd_alignment import align_frames
 from posegraph_slam.sensors import RgbdSequence, RobotLog
@@ -70,8 +70,7 @@ class RgbdResult:
     @property
     def rejected_pairs(self) -> IntArray:
         """Target and source keyframe (R, 2) of the candidates that were rejected."""
-        pairs = [(record.target, record.source) for record in self.loops if not record.accepted]
-        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        return rejected_pairs(self.loops)
 
 
 def optimize_rgbd(
@@ -139,20 +138,12 @@ def optimize_rgbd(
 
 def keyframe_chain(tracked: RgbdOdometry) -> PoseGraph:
     """Return the graph of the keyframes, each tied to the one before by its alignment; the first is fixed."""
-    poses = tracked.trajectory.poses[tracked.keyframes]
-    count = len(poses)
-    return PoseGraph(
-        poses=poses,
-        session=np.zeros(count, dtype=np.int64),
-        index=tracked.keyframes,
-        fixed=np.arange(count) == 0,
-        constraints=Constraints(
-            i=np.arange(count - 1),
-            j=np.arange(1, count),
-            T_i_j=tracked.T_i_j,
-            information=tracked.information,
-            kind=np.where(tracked.guessed, int(ConstraintKind.ODOMETRY), int(ConstraintKind.SCAN_MATCHING)),
-        ),
+    return PoseGraph.chain(
+        tracked.trajectory.poses[tracked.keyframes],
+        tracked.keyframes,
+        T_i_j=tracked.T_i_j,
+        information=tracked.information,
+        kind=np.where(tracked.guessed, int(ConstraintKind.ODOMETRY), int(ConstraintKind.SCAN_MATCHING)),
     )
 
 
@@ -243,25 +234,12 @@ def _compared(
 
 def _summary(tracked: RgbdOdometry, closed: LoopClosureResult, cloud: ColourCloud | None) -> dict[str, Any]:
     """Counts of the run for `metrics.json`."""
-    accepted = [record for record in closed.records if record.accepted]
     return {
         "frames": len(tracked.trajectory),
         "frames_tracked": int(tracked.tracked.sum()),
         "keyframes": len(tracked.keyframes),
         "guessed_motions": int(tracked.guessed.sum()),
-        "loops_proposed": len(closed.records),
-        "loops_accepted": len(accepted),
-        "loops_by_kind": {
-            kind: {
-                "proposed": sum(record.kind == kind for record in closed.records),
-                "accepted": sum(record.kind == kind for record in accepted),
-            }
-            for kind in sorted({record.kind for record in closed.records})
-        },
-        "loop_rounds": closed.rounds,
-        "graph_cost_initial": closed.solution.cost_initial,
-        "graph_cost": closed.solution.cost,
-        "solver_stop_reason": str(closed.solution.stop_reason),
+        **closed.summary(),
         "cloud_points": len(cloud) if cloud is not None else 0,
         "cloud_voxel_m": cloud.voxel_m if cloud is not None else None,
     }
@@ -274,9 +252,7 @@ def _without_replaced(remarks: tuple[str, ...], camera_given: bool) -> tuple[str
 
 def _warnings(closed: LoopClosureResult, cloud: ColourCloud | None, settings: ColourCloudSettings) -> tuple[str, ...]:
     """Plain sentences on what a user should look at."""
-    remarks = list(closed.solution.notes)
-    if not closed.solution.converged:
-        remarks.append(f"the pose graph did not converge: {closed.solution.stop_reason}")
+    remarks = closed.warnings()
     if cloud is not None and cloud.voxel_m > settings.voxel_m:
         remarks.append(
             f"the cloud's voxels were widened to {cloud.voxel_m:g} m to bound memory (rgbd.cloud.voxels_max)"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from posegraph_slam.mapping.crispness import crispness
 from posegraph_slam.odometry.scan_odometry import odometry_at_scans
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.optimize import usable_scans
-from posegraph_slam.pipeline.recording import Report, RunSummary, recorded_run
+from posegraph_slam.pipeline.recording import RunOptions, RunSummary, recorded_run
 from posegraph_slam.pipeline.run_directory import METRICS
 from posegraph_slam.pipeline.saving import save_occupancy
 from posegraph_slam.sensors import RobotLog
@@ -26,28 +27,14 @@ def run_particle_slam(
     log_path: Path,
     configuration: Configuration,
     *,
-    out: Path,
-    overwrite: bool = False,
-    log_format: str | None = None,
-    topics: Mapping[str, str] | None = None,
-    report: Report | None = None,
     progress: Progress = silent_progress,
-    command: Sequence[str] | None = None,
+    **options: Unpack[RunOptions],
 ) -> RunSummary:
     """Run the particle filter on the log at `log_path` and leave trajectory and map in the run directory `out`.
 
     Raises InputError where `out` is taken or the log cannot be used; nothing is then left.
     """
-    with recorded_run(
-        log_path,
-        configuration,
-        out=out,
-        overwrite=overwrite,
-        log_format=log_format,
-        topics=topics,
-        report=report,
-        command=command,
-    ) as run:
+    with recorded_run(log_path, configuration, **options) as run:
         scans = usable_scans(run.log)
         with run.clock.stage("odometry"):
             odometry = odometry_at_scans(run.log, configuration.odometry)
@@ -71,7 +58,7 @@ def run_particle_slam(
             save_occupancy(result.occupancy, run.directory)
             run.directory.write_json(METRICS, metrics)
     remarks = (*run.log.remarks, *odometry.remarks)
-    return RunSummary(folder=out, table=table, metrics=metrics, record=run.record, remarks=remarks)
+    return RunSummary(folder=run.folder, table=table, metrics=metrics, record=run.record, remarks=remarks)
 
 
 def measure(log: RobotLog, odometry: Trajectory, result: ParticleSlamResult) -> Mapping[str, TrajectoryMetrics]:

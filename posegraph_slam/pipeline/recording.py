@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Required, TypedDict
 
 from posegraph_slam.datasets import read
 from posegraph_slam.evaluation.tables import ComparisonTable
@@ -42,14 +42,32 @@ class RunSummary(RunOutcome):
 class RunUnderWay:
     """A run that is going on: the log it reads, where it writes, and its clock.
 
-    `inputs` are further entries of its record, which is complete once the block of `recorded_run` has ended.
+    `folder` will be its run directory, `directory` is the one it writes until then. `inputs` are further entries of
+    its record, which is complete once the block of `recorded_run` has ended.
     """
 
     log: RobotLog
+    folder: Path
     directory: RunDirectory
     clock: StageClock
     inputs: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
+
+
+class RunOptions(TypedDict, total=False):
+    """What every run may be told, as keyword arguments: where it writes, and how it reads its log."""
+
+    out: Required[Path]
+    """The run directory, which appears when all is written; an error leaves nothing."""
+    overwrite: bool
+    """Replace a run directory that is there already."""
+    log_format: str | None
+    """Name of the log's format; found out where not given."""
+    topics: Mapping[str, str] | None
+    """Topics of a bag, by sensor."""
+    report: Report | None
+    command: Sequence[str] | None
+    """Command line for the record, where it is not that of this process."""
 
 
 @contextmanager
@@ -66,8 +84,8 @@ def recorded_run(
 ) -> Iterator[RunUnderWay]:
     """Read the log at `log_path`, yield the run to be done with it, and record how it went.
 
-    The run directory `out` appears when the block has ended and all is written; an error leaves nothing. Raises
-    InputError where `out` is taken or the log cannot be read.
+    The arguments are `RunOptions`. The run directory `out` appears when the block has ended and all is written; an
+    error leaves nothing. Raises InputError where `out` is taken or the log cannot be read.
     """
     require_free(out, overwrite=overwrite)
     clock = StageClock()
@@ -75,7 +93,7 @@ def recorded_run(
         with measure_compile_time() as compiling:
             with clock.stage("reading"):
                 log = read(log_path, format=log_format, topics=topics)
-            run = RunUnderWay(log=log, directory=directory, clock=clock)
+            run = RunUnderWay(log=log, folder=out, directory=directory, clock=clock)
             yield run
         directory.write_configuration(configuration)
         written = run_record(

@@ -126,6 +126,30 @@ class PoseGraph:
         if not len(self.poses) == len(self.session) == len(self.index) == len(self.fixed):
             raise GraphError("pose graph", "poses, session, index and fixed differ in length")
 
+    @staticmethod
+    def chain(
+        poses: FloatArray, index: IntArray, *, T_i_j: FloatArray, information: FloatArray, kind: int | IntArray
+    ) -> PoseGraph:
+        """Return nodes (N) of one session, each tied to the one before; the first holds the gauge.
+
+        `index` (N,) names the nodes; `T_i_j` (N-1, d+1, d+1), `information` (N-1, p, p) and `kind` (N-1,), or one kind
+        for all, are those of the constraints.
+        """
+        count = len(poses)
+        return PoseGraph(
+            poses=poses,
+            session=np.zeros(count, dtype=np.int64),
+            index=index,
+            fixed=np.arange(count) == 0,
+            constraints=Constraints(
+                i=np.arange(count - 1),
+                j=np.arange(1, count),
+                T_i_j=T_i_j,
+                information=information,
+                kind=np.broadcast_to(np.asarray(kind, dtype=np.int64), count - 1),
+            ),
+        )
+
     def __len__(self) -> int:
         return int(self.poses.shape[0])
 
