@@ -30,31 +30,40 @@ if TYPE_CHECKING:
     from posegraph_slam.pipeline.run import RunSummary
 
 
+RunFolder = Annotated[Path | None, typer.Option("--out", "-o", help="Run directory; default: runs/NAME OF LOG.")]
+Truth = Annotated[Path | None, typer.Option("--truth", help="File of true poses: TUM, KITTI, EuRoC or CSV.")]
+Camera = Annotated[
+    Path | None, typer.Option("--camera", help="File of intrinsics for RGB-D images (JSON, or ROS' YAML).")
+]
+Workers = Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")]
+NoLoops = Annotated[bool, typer.Option("--no-loops", help="Close no loops: scan matching alone.")]
+Stages = Annotated[
+    str | None, typer.Option("--stages", help="Only these, comma-separated: odometry, matching, graph, maps.")
+]
+Start = Annotated[
+    str | None,
+    typer.Option("--from", metavar="STAGE", help="LOG is a run directory: start over from `matching` or `graph`."),
+]
+EditsFile = Annotated[
+    Path | None, typer.Option("--edits", metavar="FILE", help="With --from graph: closures edited by hand.")
+]
+
+
 def optimize(
     log: Log,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run directory; default: runs/NAME OF LOG.")] = None,
+    out: RunFolder = None,
     config: Config = None,
     settings: Set = None,
-    truth: Annotated[Path | None, typer.Option("--truth", help="File of true poses: TUM, KITTI, EuRoC or CSV.")] = None,
+    truth: Truth = None,
     log_format: Format = None,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", help="File of intrinsics for RGB-D images (JSON, or ROS' YAML).")
-    ] = None,
+    camera: Camera = None,
     topic: Topic = None,
     seed: Seed = None,
-    workers: Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")] = None,
-    no_loops: Annotated[bool, typer.Option("--no-loops", help="Close no loops: scan matching alone.")] = False,
-    stages: Annotated[
-        str | None,
-        typer.Option("--stages", help="Only these, comma-separated: odometry, matching, graph, maps."),
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option("--from", metavar="STAGE", help="LOG is a run directory: start over from `matching` or `graph`."),
-    ] = None,
-    edits: Annotated[
-        Path | None, typer.Option("--edits", metavar="FILE", help="With --from graph: closures edited by hand.")
-    ] = None,
+    workers: Workers = None,
+    no_loops: NoLoops = False,
+    stages: Stages = None,
+    start: Start = None,
+    edits: EditsFile = None,
     page: Page = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

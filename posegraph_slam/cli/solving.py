@@ -12,6 +12,7 @@ from posegraph_slam.cli.arguments import Json, Quiet, Verbose
 from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table, print_warning
 
 if TYPE_CHECKING:
+    from posegraph_slam.pose_graph.graph import PoseGraph
     from posegraph_slam.pose_graph.optimum import Optimum
 
 Graph = Annotated[Path, typer.Argument(metavar="GRAPH", help="Pose graph: .g2o, .graph or .toro.")]
@@ -79,9 +80,8 @@ def solve(
     --out, --edges and --plot write files; nothing else is written.
     """
     from posegraph_slam.cli.graph_requests import covariances, edited, optimum_settings
-    from posegraph_slam.pose_graph.files import check_graph_name, read_graph
+    from posegraph_slam.pose_graph.files import check_graph_name
     from posegraph_slam.pose_graph.optimum import find_optimum
-    from posegraph_slam.pose_graph.warmup import load_kernels
 
     settings = optimum_settings(
         {"start": init, "certify": not no_certify,
@@ -90,16 +90,12 @@ def solve(
     )  # fmt: skip
     if out is not None:
         check_graph_name(out)
-    load_kernels(graph)  # so that the times reported are those of the graph
-    began = time.perf_counter()
-    whole = read_graph(graph)
-    read_s = time.perf_counter() - began
+    whole, read_s = read_timed(graph)
     problem, notes = edited(
         whole, component=component, clamp=clamp, drop_edges=drop_edge, drop_kinds=drop_kind, add_edges=add_edge
     )
-    if not as_json and not quiet:
-        for note in notes:
-            print_note(note)
+    for note in () if as_json or quiet else notes:
+        print_note(note)
     with ProgressBars(enabled=not quiet and not as_json) as progress:
         optimum = find_optimum(problem, settings, progress=progress)
     seconds = {"read": read_s, **optimum.seconds, "write": write_files(optimum, out, edges)}
@@ -114,6 +110,17 @@ def solve(
         print_covariances(asked)
     if not optimum.result.converged:
         print_warning(f"no optimum was reached: {optimum.stop_reason}")
+
+
+def read_timed(path: Path) -> tuple[PoseGraph, float]:
+    """Read a graph; return it and the seconds that took, kernels loaded before, so that later times are its own too."""
+    from posegraph_slam.pose_graph.files import read_graph
+    from posegraph_slam.pose_graph.warmup import load_kernels
+
+    load_kernels(path)
+    began = time.perf_counter()
+    graph = read_graph(path)
+    return graph, time.perf_counter() - began
 
 
 def write_files(optimum: Optimum, out: Path | None, edges: Path | None) -> float:

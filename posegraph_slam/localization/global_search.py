@@ -10,7 +10,14 @@ from posegraph_slam.arrays import ByteArray, FloatArray
 from posegraph_slam.jit import kernel
 from posegraph_slam.localization.map_field import FREE, OCCUPIED, MapField
 from posegraph_slam.localization.settings import GlobalSearchSettings
-from posegraph_slam.registration.correlative import FIELD_MAX, block_score, likelihood_field, max_pooled, rotated_cells
+from posegraph_slam.registration.correlative import (
+    FIELD_MAX,
+    block_score,
+    insert_block,
+    likelihood_field,
+    max_pooled,
+    rotated_cells,
+)
 
 LEVELS = 5
 """Blocks of the coarsest level are 2^5 cells wide: 3.2 m at 0.1 m."""
@@ -140,10 +147,6 @@ def search_peaks(stack, free, cells, gaps, least, peaks_max):  # type: ignore[no
                 score = block_score(stack[level - 1], cells[a], qx, qy)
                 if score <= threshold:
                     continue
-                at = top
-                while at > first and todo[at - 1, 3] > score:
-                    todo[at] = todo[at - 1]
-                    at -= 1
-                todo[at, 0], todo[at, 1], todo[at, 2], todo[at, 3] = qx, qy, level - 1, score
+                insert_block(todo, first, top, qx, qy, level - 1, score)
                 top += 1
     return peaks[:known].copy(), scores[:known].copy()

@@ -28,6 +28,41 @@ def view_weight(drop: float, square: float) -> int:
     return int(min(max(value, 1.0), LARGEST_WEIGHT))
 
 
+@inline_kernel
+def add_nearest(colour: ByteArray, m: int, n: int, weight: int, sums: IntArray, r: int, c: int) -> None:
+    """Add the colour of pixel (m, n) to cell (r, c), with a 64th of the weight where it is saturated."""
+    red, green, blue = colour[m, n, 0], colour[m, n, 1], colour[m, n, 2]
+    if red == SATURATED or green == SATURATED or blue == SATURATED:
+        weight = max(weight // 64, 1)
+        sums[r, c, 5] += 1
+    sums[r, c, 0] += weight * red
+    sums[r, c, 1] += weight * green
+    sums[r, c, 2] += weight * blue
+    sums[r, c, 3] += weight
+
+
+@inline_kernel
+def add_between(colour: ByteArray, u: float, v: float, weight: int, sums: IntArray, r: int, c: int) -> None:
+    """Add the colour between the four pixels around (u, v) to cell (r, c), less where one is saturated."""
+    m, n = min(int(u), colour.shape[0] - 2), min(int(v), colour.shape[1] - 2)
+    a, b = u - m, v - n
+    for channel in range(3):
+        if (
+            colour[m, n, channel] == SATURATED
+            or colour[m, n + 1, channel] == SATURATED
+            or colour[m + 1, n, channel] == SATURATED
+            or colour[m + 1, n + 1, channel] == SATURATED
+        ):
+            weight = max(weight // 64, 1)
+            sums[r, c, 5] += 1
+            break
+    for channel in range(3):
+        top = (1.0 - b) * colour[m, n, channel] + b * colour[m, n + 1, channel]
+        low = (1.0 - b) * colour[m + 1, n, channel] + b * colour[m + 1, n + 1, channel]
+        sums[r, c, channel] += int(weight * ((1.0 - a) * top + a * low) + 0.5)
+    sums[r, c, 3] += weight
+
+
 @kernel
 def add_colours(
     depth: Float32Array,
@@ -81,33 +116,9 @@ def add_colours(
                 continue
             u, v = min(max(u, 0.0), colour.shape[0] - 1.0), min(max(v, 0.0), colour.shape[1] - 1.0)
             if FINE_ROWS * z * z < cell_m * focal * drop:
-                m, n = int(u + 0.5), int(v + 0.5)
-                red, green, blue = colour[m, n, 0], colour[m, n, 1], colour[m, n, 2]
-                if red == SATURATED or green == SATURATED or blue == SATURATED:
-                    weight = max(weight // 64, 1)
-                    sums[r, c, 5] += 1
-                sums[r, c, 0] += weight * red
-                sums[r, c, 1] += weight * green
-                sums[r, c, 2] += weight * blue
-                sums[r, c, 3] += weight
-                continue
-            m, n = min(int(u), colour.shape[0] - 2), min(int(v), colour.shape[1] - 2)
-            a, b = u - m, v - n
-            for channel in range(3):
-                if (
-                    colour[m, n, channel] == SATURATED
-                    or colour[m, n + 1, channel] == SATURATED
-                    or colour[m + 1, n, channel] == SATURATED
-                    or colour[m + 1, n + 1, channel] == SATURATED
-                ):
-                    weight = max(weight // 64, 1)
-                    sums[r, c, 5] += 1
-                    break
-            for channel in range(3):
-                top = (1.0 - b) * colour[m, n, channel] + b * colour[m, n + 1, channel]
-                low = (1.0 - b) * colour[m + 1, n, channel] + b * colour[m + 1, n + 1, channel]
-                sums[r, c, channel] += int(weight * ((1.0 - a) * top + a * low) + 0.5)
-            sums[r, c, 3] += weight
+                add_nearest(colour, int(u + 0.5), int(v + 0.5), weight, sums, r, c)
+            else:
+                add_between(colour, u, v, weight, sums, r, c)
 
 
 @kernel

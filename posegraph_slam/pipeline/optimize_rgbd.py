@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from posegraph_slam.pipeline.rgbd_frames import FrameImages, PreparedFrames, cho
 from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
 from posegraph_slam.pose_graph.solve import solve
 from posegraph_slam.registration.rgbd_alignment import align_frames
-from posegraph_slam.sensors import RgbdSequence, RobotLog
+from posegraph_slam.sensors import RobotLog
 
 SAMPLED_KEYFRAMES = 150
 """The thickness of surfaces is measured on so many keyframes at most."""
@@ -89,12 +89,7 @@ def optimize_rgbd(
         raise InputError(log.path, "has no RGB-D images", "give a folder of colour and depth images")
     executor, clock, settings = executor or SerialExecutor(), StageClock(), configuration.rgbd
     camera, remarks = chosen_camera(log.rgbd_sequence.camera, settings.camera)
-    sequence = RgbdSequence(
-        stamps_s=log.rgbd_sequence.stamps_s,
-        colour_files=log.rgbd_sequence.colour_files,
-        depth_files=log.rgbd_sequence.depth_files,
-        camera=camera,
-    )
+    sequence = replace(log.rgbd_sequence, camera=camera)
     images = FrameImages(sequence=sequence)
     frames = PreparedFrames(images=images, max_depth_m=settings.max_depth_m)
     with clock.stage("odometry"):

@@ -31,11 +31,10 @@ from posegraph_slam.pose_graph.chordal_cost import (
     lifted_poses,
     moved,
     multipliers,
-    tangent_gradient,
-    tangent_hessian,
     tangents,
     value,
 )
+from posegraph_slam.pose_graph.chordal_descent import Budget, minimize_chordal
 from posegraph_slam.pose_graph.graph import PoseGraph
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
 from posegraph_slam.pose_graph.sparse_solver import run_sparse
@@ -46,17 +45,10 @@ PROOF_SHIFTS = (1e-10, 1e-9, 1e-8, 1e-7, 1e-6)
 """Shifts of S tried in turn, as the share of the cost that each takes from the lower bound."""
 COST_FLOOR = 1e-9
 """Gap, as a cost, that counts as none in graphs that fit perfectly."""
-FACTORISATIONS = 100
-"""Most of them in one minimisation, far more than proofs need that succeed."""
 CLIMB_WORK = 1e11
 """Multiplications (some five seconds of them) that may be spent on higher ranks: without a limit, large graphs whose
 relaxation is not tight would take minutes."""
-LEAST_FACTORISATIONS = 20
-"""What a minimisation gets even if it spends more than that."""
 EXTRA_RANKS = 3
-LEVEL = 1e-13
-"""Share of the cost below which a decrease drowns in rounding."""
-LEAST_COST = 1e-20
 
 
 class CertificateStatus(StrEnum):
@@ -99,13 +91,6 @@ class Certificate:
     def proven(self) -> bool:
         """Whether the chordal cost is proven to be the least."""
         return self.chordal_cost - self.lower_bound <= GAP_TOLERANCE * self.chordal_cost + COST_FLOOR
-
-
-@dataclass(slots=True)
-class Budget:
-    """Multiplications that are left to be spent."""
-
-    left: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -202,48 +187,6 @@ def _unfit(graph: PoseGraph) -> str | None:
     if len(graph.constraints) == 0:
         return "the graph has no constraints"
     return None
-
-
-def minimize_chordal(
-    problem: ChordalProblem, at: Lifted, anchors: BoolArray, *, budget: Budget | None = None
-) -> tuple[Lifted, float]:
-    """Minimise F from lifted poses by damped Newton steps with the exact Hessian; `anchors` (n,) do not move.
-
-    Multiplications are taken from the budget, and end with it after `LEAST_FACTORISATIONS`.
-    """
-    d, rank = problem.dimension, at.Q.shape[1]
-    basis = tangents(d, rank)
-    pattern = block_pattern(len(anchors), problem.i, problem.j, len(basis.row), kept=~anchors)
-    cost, G = value(problem, at)
-    damping, before = 0.0, np.inf
-    budget = Budget(np.inf) if budget is None else budget
-    done, work = 0, pattern.work
-    while done < LEAST_FACTORISATIONS or (done < FACTORISATIONS and budget.left > 0):
-        gradient = tangent_gradient(at.Q, G, basis.row, basis.column, basis.sign)
-        S = certificate_diagonal(problem, multipliers(at, G))
-        diagonal, off = tangent_hessian(at.Q, problem.i, problem.j, S, problem.off_diagonal, basis.row, basis.column,
-                                        basis.sign)  # fmt: skip
-        least = 1e-10 * float(np.mean(np.abs(np.trace(problem.diagonal, axis1=1, axis2=2))))
-        while True:
-            factor = factorize(pattern, diagonal, off, damping)
-            done, budget.left = done + 1, budget.left - work
-            if factor is not None:
-                delta = -solve_factored(pattern, factor, gradient)
-                predicted = -float(np.sum(delta * gradient))
-                trial = moved(at, basis, delta, d)
-                new_cost, new_G = value(problem, trial)
-                if new_cost <= cost or predicted <= LEVEL * cost:
-                    break
-            damping = max(10 * damping, least)
-            if damping > 1e20 * least or done >= FACTORISATIONS:
-                return at, cost
-        at, cost, G = trial, new_cost, new_G
-        damping = damping / 10 if damping > least else 0.0
-        # The multipliers need the gradient to its last digits, well after the cost stopped falling.
-        if cost < LEAST_COST or (predicted <= LEVEL * cost and predicted >= 0.1 * before):
-            break
-        before = predicted
-    return at, cost
 
 
 def _verdict(problem: ChordalProblem, pattern: BlockPattern, at: Lifted, anchors: BoolArray) -> _Verdict:

@@ -12,14 +12,14 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.arrays import IntArray
 from posegraph_slam.jit import kernel
 
 UIntArray = npt.NDArray[np.uint64]
 Bytes = npt.NDArray[np.uint8]
 
 LEAST_POWER, LARGEST_POWER = -342, 308
-ZERO, ONE, TWO, THREE = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+ZERO, ONE, THREE = np.uint64(0), np.uint64(1), np.uint64(3)
 TEN, S32, LOW32 = np.uint64(10), np.uint64(32), np.uint64(0xFFFFFFFF)
 ALL, PRECISION = np.uint64(0xFFFFFFFFFFFFFFFF), np.uint64(0x1FF)
 HIDDEN, S9, S52, S63 = np.uint64(1 << 52), np.uint64(9), np.uint64(52), np.uint64(63)
@@ -228,14 +228,3 @@ def parse_lines(data: Bytes, tags: Bytes, tag_start: IntArray, id_counts: IntArr
             at += 1
         at += 1
     return True
-
-
-def parse_reals(words: list[str]) -> FloatArray | None:
-    """Parse single words, each a record of one real; None if one is left to the slow path. For tests."""
-    data = np.frombuffer("".join(f"X {word}\n" for word in words).encode(), np.uint8)
-    upper5, lower5 = powers_of_five()
-    zero, n = np.zeros(1, np.int64), len(words)
-    reals = np.zeros(n, np.uint64)
-    done = parse_lines(data, np.frombuffer(b"X", np.uint8), np.array([0, 1]), np.array([0]), np.array([1]), zero, zero,
-                       zero, upper5, lower5, np.zeros(0, np.int64), reals, np.zeros(n, np.int64))  # fmt: skip
-    return reals.view(np.float64) if done else None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from posegraph_slam.jit import kernel
+from posegraph_slam.jit import inline_kernel, kernel
 
 FIELD_MAX = 255.0
 """Field value on a reference point."""
@@ -101,6 +101,16 @@ NO_DISC = (0, 0, -1)
 """Centre and radius in cells of a disc that excludes nothing."""
 
 
+@inline_kernel
+def insert_block(todo, first, top, x, y, level, score):  # type: ignore[no-untyped-def]
+    """Put a block [x, y, level, score] among the rows from `first` to `top` of `todo`, where scores rise."""
+    at = top
+    while at > first and todo[at - 1, 3] > score:
+        todo[at] = todo[at - 1]
+        at -= 1
+    todo[at, 0], todo[at, 1], todo[at, 2], todo[at, 3] = x, y, level, score
+
+
 @kernel
 def branch_and_bound(stack, cells, reach, least, disc):  # type: ignore[no-untyped-def]
     """Best (angle index, dx, dy, score sum) within `reach` cells whose score exceeds `least`, else score -1.
@@ -155,10 +165,6 @@ def branch_and_bound(stack, cells, reach, least, disc):  # type: ignore[no-untyp
                 score = block_score(stack[level - 1], cells[a], qx, qy)
                 if score <= best:
                     continue
-                at = top
-                while at > first and todo[at - 1, 3] > score:
-                    todo[at] = todo[at - 1]
-                    at -= 1
-                todo[at, 0], todo[at, 1], todo[at, 2], todo[at, 3] = qx, qy, level - 1, score
+                insert_block(todo, first, top, qx, qy, level - 1, score)
                 top += 1
     return best_a, best_x, best_y, best if found else -1

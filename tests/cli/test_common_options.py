@@ -22,7 +22,6 @@ from posegraph_slam.cli.application import app
 from posegraph_slam.datasets.simulation import simulate, tiny_settings
 from posegraph_slam.errors import did_you_mean
 
-PSG = [sys.executable, "-c", "from posegraph_slam.cli import main; main()"]
 WITHOUT_TABLE = {"simulate", "edit"}
 """Commands that write files or serve pages, and print no table."""
 

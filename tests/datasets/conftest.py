@@ -155,15 +155,7 @@ def build(name: str, folder: Path) -> Path:
 def build_truncated(name: str, folder: Path) -> tuple[Path, Path]:
     """Write a log whose last bytes are missing; return its path and the file that the error has to name."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = {
-        "ece276a": lambda: write_ece276a(folder / "run"),
-        "carmen": lambda: write_carmen(folder / "log.clf.gz"),
-        "imu_vicon": lambda: write_imu_vicon(folder / "run.npz"),
-        "rosbag": lambda: store_as("ros1", folder, robot(maker_of("ros1"))),
-        "euroc": lambda: write_euroc(folder / "sequence"),
-        "humanoid": lambda: write_humanoid_log(folder, rng=np.random.default_rng(1), scans=12, beams=241),
-        "rgbd": lambda: write_rgbd(folder / "sequence"),
-    }[name]()
+    path = write_carmen(folder / "log.clf.gz") if name == "carmen" else build(name, folder)
     file = path
     if path.is_dir():
         file = path / {"euroc": "mav0/imu0/data.csv", "rgbd": "depth/00002.png"}.get(name, "Hokuyo7.npz")

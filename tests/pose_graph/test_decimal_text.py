@@ -7,7 +7,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from posegraph_slam.pose_graph.decimal_text import parse_reals
+from posegraph_slam.arrays import FloatArray
+from posegraph_slam.pose_graph.decimal_text import parse_lines, powers_of_five
+
+
+def parse_reals(words: list[str]) -> FloatArray | None:
+    """Parse single words, each a record of one real; None if one is left to the slow path."""
+    data = np.frombuffer("".join(f"X {word}\n" for word in words).encode(), np.uint8)
+    upper5, lower5 = powers_of_five()
+    zero, n = np.zeros(1, np.int64), len(words)
+    reals = np.zeros(n, np.uint64)
+    done = parse_lines(data, np.frombuffer(b"X", np.uint8), np.array([0, 1]), np.array([0]), np.array([1]), zero, zero,
+                       zero, upper5, lower5, np.zeros(0, np.int64), reals, np.zeros(n, np.int64))  # fmt: skip
+    return reals.view(np.float64) if done else None
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False))

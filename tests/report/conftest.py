@@ -10,6 +10,7 @@ import os
 import select
 import shutil
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,8 @@ import pytest
 from posegraph_slam.datasets.simulation import simulate, tiny_settings
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.run import run
+from posegraph_slam.report.edit_server import EditServer
+from posegraph_slam.report.edit_session import EditSession
 from posegraph_slam.report.page import write_report_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -218,6 +221,19 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log = simulate(tiny_settings(duration_s=30.0, images=True), folder / "log")
     run(log, Configuration(workers=1), out=folder / "run", report=write_report_of)
     return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def server(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[EditServer]:
+    """Serve a copy of the run to an editor."""
+    copy = tmp_path_factory.mktemp("served") / "run"
+    shutil.copytree(small_run, copy)
+    with EditServer(EditSession(copy)) as serving:
+        thread = threading.Thread(target=serving.serve_forever, daemon=True)
+        thread.start()
+        yield serving
+        serving.shutdown()
+        thread.join()
 
 
 @pytest.fixture(scope="session")

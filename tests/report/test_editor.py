@@ -7,8 +7,6 @@ import http.client
 import json
 import shutil
 import socket
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +27,6 @@ def folder(small_run: Path, tmp_path: Path) -> Path:
     copy = tmp_path / "run"
     shutil.copytree(small_run, copy)
     return copy
-
-
-@pytest.fixture(scope="module")
-def server(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[EditServer]:
-    copy = tmp_path_factory.mktemp("served") / "run"
-    shutil.copytree(small_run, copy)
-    with EditServer(EditSession(copy)) as serving:
-        thread = threading.Thread(target=serving.serve_forever, daemon=True)
-        thread.start()
-        yield serving
-        serving.shutdown()
-        thread.join()
 
 
 def closures(session: EditSession) -> list[tuple[int, int]]:

@@ -2,33 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
-
-import pytest
 
 from posegraph_slam.pipeline.edits import read_edits
 from posegraph_slam.report.edit_server import EditServer
-from posegraph_slam.report.edit_session import EditSession
 
 STATE = "document.getElementById('edit-state').textContent"
 DONE = "window.editor && !editor.busy"
-
-
-@pytest.fixture(scope="module")
-def server(browser: Any, small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[EditServer]:
-    copy = tmp_path_factory.mktemp("edited") / "run"
-    shutil.copytree(small_run, copy)
-    with EditServer(EditSession(copy)) as serving:
-        thread = threading.Thread(target=serving.serve_forever, daemon=True)
-        thread.start()
-        yield serving
-        serving.shutdown()
-        thread.join()
 
 
 def press(page: Any, button: str) -> None:

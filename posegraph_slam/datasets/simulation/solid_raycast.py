@@ -19,31 +19,24 @@ def _beams_between(bearings: FloatArray, low: float, high: float, turn: int) -> 
 
 
 @kernel
-def cast_tilted(
-    T: FloatArray,
-    angles: FloatArray,
-    segments: FloatArray,
-    circles: FloatArray,
-    spans: FloatArray,
-    patches: FloatArray,
-    ceiling: float,
-    ranges: FloatArray,
-) -> None:
-    """Fill `ranges` (B,) along the beams at `angles` (B,) of a scanner at T_world_lidar (4, 4); infinity for none.
-
-    A wall is hit only at a height within its span (S + C, 2), segments first; a wall that is overlooked hides nothing.
-    """
-    count = len(angles)
-    directions, bearings = np.empty((count, 3)), np.empty(count)
-    for k in range(count):
+def _beam_directions(T: FloatArray, angles: FloatArray, directions: FloatArray, bearings: FloatArray) -> None:
+    """Fill `directions` (B, 3) of the beams at `angles` (B,) in the world, and their rising `bearings` (B,)."""
+    for k in range(len(angles)):
         c, s = math.cos(angles[k]), math.sin(angles[k])
         for axis in range(3):
             directions[k, axis] = c * T[axis, 0] + s * T[axis, 1]
         bearings[k] = math.atan2(directions[k, 1], directions[k, 0])
         if k > 0:  # bearings rise with the beams as long as the scanner is not upside down
             bearings[k] -= 2.0 * math.pi * math.floor((bearings[k] - bearings[k - 1]) / (2.0 * math.pi) + 1e-9)
+
+
+@kernel
+def _cast_to_ground(
+    T: FloatArray, directions: FloatArray, patches: FloatArray, ceiling: float, ranges: FloatArray
+) -> None:
+    """Set `ranges` (B,) to the ceiling or the nearest of the ground's rectangles `patches` (P, 6)."""
     x, y, z = T[0, 3], T[1, 3], T[2, 3]
-    for k in range(count):
+    for k in range(len(directions)):
         nearest = (ceiling - z) / directions[k, 2] if directions[k, 2] > 0.0 else np.inf
         for p in range(len(patches)):
             rise = patches[p, 5]
@@ -57,6 +50,19 @@ def cast_tilted(
             if patches[p, 0] <= px <= patches[p, 1] and patches[p, 2] <= py <= patches[p, 3]:
                 nearest = t
         ranges[k] = nearest
+
+
+@kernel
+def _cast_to_segments(
+    T: FloatArray,
+    directions: FloatArray,
+    bearings: FloatArray,
+    segments: FloatArray,
+    spans: FloatArray,
+    ranges: FloatArray,
+) -> None:
+    """Shorten `ranges` (B,) to straight walls `segments` (S, 4) that reach from `spans` (S, 2) low to high."""
+    x, y, z = T[0, 3], T[1, 3], T[2, 3]
     for s in range(len(segments)):
         ax, ay, bx, by = segments[s, 0] - x, segments[s, 1] - y, segments[s, 2] - x, segments[s, 3] - y
         cross, ex, ey = ax * by - ay * bx, bx - ax, by - ay
@@ -73,11 +79,24 @@ def cast_tilted(
                     height = z + t * directions[k, 2]
                     if spans[s, 0] <= height <= spans[s, 1]:
                         ranges[k] = t
+
+
+@kernel
+def _cast_to_circles(
+    T: FloatArray,
+    directions: FloatArray,
+    bearings: FloatArray,
+    circles: FloatArray,
+    spans: FloatArray,
+    ranges: FloatArray,
+) -> None:
+    """Shorten `ranges` (B,) to round walls `circles` (C, 3) that reach from `spans` (C, 2) low to high."""
+    x, y, z = T[0, 3], T[1, 3], T[2, 3]
     for n in range(len(circles)):
         cx, cy, radius = circles[n, 0] - x, circles[n, 1] - y, circles[n, 2]
         gap, a = cx * cx + cy * cy - radius * radius, math.atan2(cy, cx)
         half = math.asin(radius / math.sqrt(cx * cx + cy * cy)) if gap > 0.0 else math.pi
-        low, high = spans[len(segments) + n, 0], spans[len(segments) + n, 1]
+        low, high = spans[n, 0], spans[n, 1]
         for turn in range(-1, 3):
             first, last = _beams_between(bearings, a - half, a + half, turn)
             for k in range(first, last):
@@ -89,6 +108,28 @@ def cast_tilted(
                 t = (middle - math.sqrt(root)) / square
                 if 0.0 <= t < ranges[k] and low <= z + t * directions[k, 2] <= high:
                     ranges[k] = t
+
+
+@kernel
+def cast_tilted(
+    T: FloatArray,
+    angles: FloatArray,
+    segments: FloatArray,
+    circles: FloatArray,
+    spans: FloatArray,
+    patches: FloatArray,
+    ceiling: float,
+    ranges: FloatArray,
+) -> None:
+    """Fill `ranges` (B,) along the beams at `angles` (B,) of a scanner at T_world_lidar (4, 4); infinity for none.
+
+    A wall is hit only at a height within its span (S + C, 2), segments first; a wall that is overlooked hides nothing.
+    """
+    directions, bearings = np.empty((len(angles), 3)), np.empty(len(angles))
+    _beam_directions(T, angles, directions, bearings)
+    _cast_to_ground(T, directions, patches, ceiling, ranges)
+    _cast_to_segments(T, directions, bearings, segments, spans[: len(segments)], ranges)
+    _cast_to_circles(T, directions, bearings, circles, spans[len(segments) :], ranges)
 
 
 @kernel
