@@ -18,7 +18,7 @@ from posegraph_slam.geometry import SE3
 from posegraph_slam.loop_closure.appearance import appearance_similarity, nearest_word
 from posegraph_slam.loop_closure.rgbd_closing import RgbdLoopRecord, RgbdLoopSettings, close_rgbd_loops
 from posegraph_slam.loop_closure.rgbd_views import KeyframeViews, RgbdProposalSettings, propose_overlapping
-from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
+from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
 from posegraph_slam.pose_graph.noise import information_isotropic
 from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
@@ -49,17 +49,13 @@ def drifting_chain(step: FloatArray, *, sigma_m: float = 0.02, sigma_rad: float 
         poses.append(poses[-1] @ T)
     count = len(poses)
     information = information_isotropic(SE3, sigma_translation_m=sigma_m, sigma_rotation_rad=sigma_rad)
-    return PoseGraph(
-        poses=np.stack(poses),
-        session=np.zeros(count, dtype=np.int64),
-        index=np.arange(count),
-        fixed=np.arange(count) == 0,
-        constraints=Constraints(
-            i=np.arange(count - 1), j=np.arange(1, count), T_i_j=motions,
-            information=np.tile(information, (count - 1, 1, 1)),
-            kind=np.full(count - 1, int(ConstraintKind.SCAN_MATCHING)),
-        ),
-    )  # fmt: skip
+    return PoseGraph.chain(
+        np.stack(poses),
+        np.arange(count),
+        T_i_j=motions,
+        information=np.tile(information, (count - 1, 1, 1)),
+        kind=int(ConstraintKind.SCAN_MATCHING),
+    )
 
 
 def worst(poses: FloatArray) -> float:
