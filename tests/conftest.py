@@ -1,8 +1,9 @@
-"""What all tests share: the folder of real logs, and a reproducible hypothesis profile."""
+"""What all tests share: the folder of real logs, a reproducible hypothesis profile, and coarse pictures."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "reproducible"))
+
+DRAWING_ROOMS = {"api", "cli", "datasets", "pipeline", "report"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -38,3 +41,17 @@ def psg_data() -> Path:
     if not folder.is_dir():
         pytest.fail(f"PSG_DATA names {folder}, which is not a folder")
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def coarse_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Draw the pictures of runs at half their resolution: drawing them takes four fifths of a short run."""
+    if not DRAWING_ROOMS & {item.path.parent.name for item in request.session.items}:
+        yield  # no test draws: spare them the import
+        return
+    from posegraph_slam.report import attitude_figures, canvas, evaluation_figures
+
+    assert attitude_figures.DPI == evaluation_figures.DPI == canvas.DPI  # these two keep theirs
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(canvas, "DPI", canvas.DPI // 2)
+        yield

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from posegraph_slam.datasets import read
-from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.configuration import Configuration, load_configuration
 from posegraph_slam.pipeline.optimize import OptimizationResult, optimize
 
 
@@ -16,7 +16,7 @@ def simulated(name: str, size: float, seed: int = 1) -> tuple[OptimizationResult
     from logs import build  # type: ignore[import-not-found]
 
     log = build(name, size=size, seed=seed)
-    return optimize(log.robot_log(), Configuration()), log.truth().poses
+    return optimize(log.robot_log(), load_configuration(overrides=["maps=false"])), log.truth().poses
 
 
 @pytest.mark.data

@@ -129,7 +129,8 @@ def test_existing_run_is_refused_then_replaced(run: Path, log: Path) -> None:
     out = run.parent / "replaced"
     shutil.copytree(run, out)
     (out / "stale.txt").write_text("left over")
-    result = psg("optimize", log, "--out", out, "--overwrite", "--json", "--set", "mapping.resolution_m=0.1")
+    result = psg("optimize", log, "--out", out, "--overwrite", "--json", "--set", "mapping.resolution_m=0.1",
+                 "--stages", "odometry")  # fmt: skip
     value = json.loads(result.stdout)
     assert value["folder"] == str(out)
     assert value["metrics"]["scans"] > 0
@@ -139,7 +140,8 @@ def test_existing_run_is_refused_then_replaced(run: Path, log: Path) -> None:
 
 def test_another_truth_is_compared_with(run: Path, log: Path, tmp_path: Path) -> None:
     truth = run / "odometry.tum"
-    result = psg("optimize", log, "--out", tmp_path / "run", "--truth", truth, "--json", "--set", "seed=1")
+    quick = ("--stages", "odometry", "--set", "seed=1")
+    result = psg("optimize", log, "--out", tmp_path / "run", "--truth", truth, "--json", *quick)
     rows = json.loads(result.stdout)["metrics"]["stages"]
     assert rows["odometry"]["ape"]["translation_m"]["rmse"] < 1e-5
     assert "absent.tum" in fails("optimize", log, "--out", tmp_path / "other", "--truth", tmp_path / "absent.tum")

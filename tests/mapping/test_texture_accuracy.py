@@ -51,13 +51,16 @@ def disparity(run: SimulatedRun, tmp_path_factory: pytest.TempPathFactory) -> tu
     return tuple(files)
 
 
-def rgbd(
-    run: SimulatedRun, disparity: tuple[Path, ...], floor: FloorTexture, folder: Path, gains: np.ndarray
-) -> RgbdFrames:
-    """Frames whose colour images show `floor`, each a little later than its disparity image."""
-    view, files = camera.colour_view(CALIBRATION), []
-    for k, xyt in enumerate(run.motion.xyt_at(TIMES_S + COLOUR_LAG_S)):
-        image = camera.render_colour(view, run.world, floor, xyt)
+def images_of(run: SimulatedRun, floor: FloorTexture) -> list[np.ndarray]:
+    """Colour images that show `floor`, each taken a little later than its disparity image, before any exposure."""
+    view = camera.colour_view(CALIBRATION)
+    return [camera.render_colour(view, run.world, floor, xyt) for xyt in run.motion.xyt_at(TIMES_S + COLOUR_LAG_S)]
+
+
+def rgbd(images: list[np.ndarray], disparity: tuple[Path, ...], folder: Path, gains: np.ndarray) -> RgbdFrames:
+    """Frames whose colour images are `images`, each exposed in its own way."""
+    files = []
+    for k, image in enumerate(images):
         files.append(folder / f"{k}.png")
         cv2.imwrite(str(files[-1]), camera.expose(image, gains[k])[..., ::-1], FAST)
     return RgbdFrames(
@@ -94,7 +97,7 @@ def share_in_own_cell(texture: TextureMap, level: np.ndarray | float = 1.0) -> t
     return float((error <= texture.geometry.resolution_m / 2).all(axis=1).mean()), int(clear.sum())
 
 
-def mean_colours(floor: FloorTexture, geometry: GridGeometry, parts: int = 10) -> np.ndarray:
+def mean_colours(floor: FloorTexture, geometry: GridGeometry, parts: int = 5) -> np.ndarray:
     """The mean colour (R, C, 3) of the floor in every cell, over parts x parts points in each."""
     cells = np.stack(np.mgrid[: geometry.shape[0], : geometry.shape[1]], axis=-1)
     centre, total = geometry.cell_to_world(cells), np.zeros((*geometry.shape, 3))
@@ -117,8 +120,23 @@ def exposures(change: float) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def coded(run, disparity, tmp_path_factory) -> RgbdFrames:
-    return rgbd(run, disparity, coded_floor(run), tmp_path_factory.mktemp("coded"), exposures(0.0))
+def coded_images(run) -> list[np.ndarray]:
+    return images_of(run, coded_floor(run))
+
+
+@pytest.fixture(scope="module")
+def coded(coded_images, disparity, tmp_path_factory) -> RgbdFrames:
+    return rgbd(coded_images, disparity, tmp_path_factory.mktemp("coded"), exposures(0.0))
+
+
+@pytest.fixture(scope="module")
+def floor(run) -> FloorTexture:
+    return build_floor(run.world, run.settings.world, 0.02, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def floor_images(run, floor) -> list[np.ndarray]:
+    return images_of(run, floor)
 
 
 @pytest.mark.parametrize("method", list(FloorMethod))
@@ -131,8 +149,8 @@ def test_cells_show_their_own_place(coded, path, method):
     assert share >= 0.98
 
 
-def test_cells_show_their_own_place_under_changing_exposure(run, path, disparity, tmp_path):
-    frames = rgbd(run, disparity, coded_floor(run), tmp_path, exposures(0.2))
+def test_cells_show_their_own_place_under_changing_exposure(coded_images, path, disparity, tmp_path):
+    frames = rgbd(coded_images, disparity, tmp_path, exposures(0.2))
     texture = build_texture(frames, path)
     level = np.exp(np.log(texture.gains).mean(axis=0) - np.log(exposures(0.2)).mean())  # the gauge: mean exposure
     np.testing.assert_allclose(texture.gains, exposures(0.2)[:, None] * level, rtol=0.03)
@@ -142,9 +160,8 @@ def test_cells_show_their_own_place_under_changing_exposure(run, path, disparity
 
 
 @pytest.mark.parametrize("change", [0.0, 0.2])
-def test_colours_are_right_whatever_the_exposure(run, path, disparity, tmp_path, change):
-    floor = build_floor(run.world, run.settings.world, 0.02, np.random.default_rng(0))
-    frames = rgbd(run, disparity, floor, tmp_path, exposures(change))
+def test_colours_are_right_whatever_the_exposure(floor, floor_images, path, disparity, tmp_path, change):
+    frames = rgbd(floor_images, disparity, tmp_path, exposures(change))
     error = colour_error(build_texture(frames, path), floor)
     assert len(error) > 12_000
     assert error.mean() <= 8

@@ -36,7 +36,8 @@ CASES = {
 @pytest.fixture(scope="module", params=CASES)
 def case(request):
     """Simulated run with the results of the planar and the spatial pipeline."""
-    run, log = simulate_run(CASES[request.param]), drive(CASES[request.param])
+    run = simulate_run(CASES[request.param])
+    log = run.log()
     found = {group: optimize(log, load_configuration([], [f"pose_graph.group={group}"])) for group in ("se2", "se3")}
     return run, log, found
 

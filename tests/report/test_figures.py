@@ -14,6 +14,7 @@ from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
+from posegraph_slam.report import canvas
 from posegraph_slam.report.canvas import BLACK, BLUE, GREEN, ORANGE, SKY, round_length
 from posegraph_slam.report.figures import align_truth, draw_map, draw_texture, draw_trajectories, loop_segments
 from posegraph_slam.report.view import MAXIMUM_PIXELS, View, bounds_around
@@ -39,6 +40,12 @@ def grid() -> OccupancyGrid:
     return OccupancyGrid(geometry=geometry, log_odds=log_odds, observed=observed)
 
 
+@pytest.fixture
+def full_resolution(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw as users see it: at half the resolution thin lines have other colours."""
+    monkeypatch.setattr(canvas, "DPI", 200)
+
+
 def share(path: Path, colour: str, tolerance: int = 12) -> float:
     """Part of the pixels that have about this colour."""
     with Image.open(path) as picture:
@@ -47,6 +54,7 @@ def share(path: Path, colour: str, tolerance: int = 12) -> float:
     return float((np.abs(pixels - wanted).max(axis=-1) <= tolerance).mean())
 
 
+@pytest.mark.usefixtures("full_resolution")
 def test_trajectories_of_all_stages_are_seen(tmp_path: Path, path_xyt: np.ndarray) -> None:
     drift = path_xyt + np.linspace(0, 1, 200)[:, None] * [1.0, -0.5, 0.0]
     stages = {"odometry": trajectory(drift), "scan matching": trajectory(drift * [0.9, 0.9, 1])}
@@ -65,6 +73,7 @@ def test_same_content_gives_the_same_bytes(tmp_path: Path, path_xyt: np.ndarray,
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+@pytest.mark.usefixtures("full_resolution")
 def test_map_shows_walls_path_and_loops(tmp_path: Path, path_xyt: np.ndarray, grid: OccupancyGrid) -> None:
     segments = np.array([[[-3.0, -3.0], [3.0, 3.0]]])
     plain, full = tmp_path / "plain.png", tmp_path / "full.png"

@@ -100,16 +100,21 @@ def test_exact_accelerometer_shows_the_acceleration_in_space(quiet):
     assert np.median(np.abs(in_body - measured)) < 0.02
 
 
-def surface(run, points):
-    """Height above the ground, below the ceiling, and distance in the plan view to the nearest obstacle."""
+def heights(run, points):
+    """Height above the ground and below the ceiling."""
+    ground = points[:, 2] - patch_height(run.world.terrain.patches, points[:, :2])
+    return ground, run.world.terrain.ceiling_m - points[:, 2]
+
+
+def gap_to_walls(run, points):
+    """Distance in the plan view to the nearest obstacle."""
     a, along = run.world.segments[:, :2], run.world.segments[:, 2:] - run.world.segments[:, :2]
     u = np.clip(((points[:, None, :2] - a) * along).sum(-1) / (along**2).sum(-1), 0, 1)
     gap = np.linalg.norm(points[:, None, :2] - a - u[..., None] * along, axis=-1).min(axis=1)
     if len(run.world.circles):
         rim = np.linalg.norm(points[:, None, :2] - run.world.circles[:, :2], axis=-1) - run.world.circles[:, 2]
         gap = np.minimum(gap, np.abs(rim).min(axis=1))
-    ground = points[:, 2] - patch_height(run.world.terrain.patches, points[:, :2])
-    return ground, run.world.terrain.ceiling_m - points[:, 2], gap
+    return gap
 
 
 def test_beams_end_at_walls_ground_or_ceiling_and_pass_through_none(quiet):
@@ -121,13 +126,13 @@ def test_beams_end_at_walls_ground_or_ceiling_and_pass_through_none(quiet):
     hit = (ranges > 0.3) & (ranges < 30)
     assert hit.mean() > 0.9
     ends = T[:, None, :3, 3] + ranges[..., None] * rays
-    ground, ceiling, wall = surface(quiet, ends[hit])
-    assert np.minimum(np.minimum(np.abs(ground), np.abs(ceiling)), wall).max() < 0.003
+    ground, ceiling = heights(quiet, ends[hit])
+    assert np.minimum(np.minimum(np.abs(ground), np.abs(ceiling)), gap_to_walls(quiet, ends[hit])).max() < 0.003
     assert (np.abs(ground) < 0.003).sum() > 20
     assert (np.abs(ceiling) < 0.003).sum() > 20
     for share in np.linspace(0.05, 0.95, 19):
         between = T[:, None, :3, 3] + (share * ranges)[..., None] * rays
-        ground, ceiling, _ = surface(quiet, between[hit])
+        ground, ceiling = heights(quiet, between[hit])
         assert ground.min() > -0.003
         assert ceiling.min() > -0.003
 

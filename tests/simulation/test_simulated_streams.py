@@ -45,7 +45,8 @@ def dead_reckon(log):
 
 def test_exact_wheels_integrate_to_the_truth():
     settings = SimulationSettings(**EXACT)
-    log, run = drive(settings), simulate_run(settings)
+    run = simulate_run(settings)
+    log = run.log()
     truth = run.motion.xyt_at(run.encoder_times_s)
     error = dead_reckon(log) - truth
     # 2 ticks of four wheels: 4.4 mm over the track 0.75 m is 6 mrad, for ever bounded; positions drift with it
@@ -59,7 +60,8 @@ def test_exact_wheels_integrate_to_the_truth():
 
 def test_slip_stays_within_its_bounds():
     settings = tiny_settings(duration_s=60.0)
-    log, run = drive(settings), simulate_run(settings)
+    run = simulate_run(settings)
+    log = run.log()
     rolled = log.encoders.travel_m.sum()
     way = 2 * run.motion.distance_at(run.encoder_times_s[-1:])[0]
     slip = settings.encoders
@@ -68,7 +70,8 @@ def test_slip_stays_within_its_bounds():
 
 
 def test_gyro_integrates_to_the_heading_and_gravity_is_up():
-    log, run = drive(SimulationSettings(**EXACT)), simulate_run(SimulationSettings(**EXACT))
+    run = simulate_run(SimulationSettings(**EXACT))
+    log = run.log()
     stamps, rate = log.imu.stamps_s, log.imu.angular_velocity[:, 2]
     turned = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(stamps))])
     assert np.abs(turned - run.motion.heading_at(run.imu_times_s)).max() < 0.01

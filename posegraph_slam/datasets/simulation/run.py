@@ -52,6 +52,44 @@ class SimulatedRun:
         poses = self.motion.spatial_poses_at(self.lidar_times_s)
         return Trajectory(stamps_s=self.stamps(self.lidar_times_s), poses=poses, parent="ref", child="base")
 
+    def log(self) -> RobotLog:
+        """Return the streams as a log without images, with the truth at every scan; see `drive`."""
+        disparity, colour = self.stamps(self.disparity_times_s), self.stamps(self.colour_times_s)
+        return RobotLog(
+            path=Path(f"simulated-{self.settings.seed}"),
+            format="simulation",
+            scans=LaserScans(
+                stamps_s=self.stamps(self.lidar_times_s),
+                ranges_m=self.ranges_m,
+                angle_min_rad=robot.LIDAR_ANGLE_MIN_RAD,
+                angle_increment_rad=streams.lidar_increment(self.settings.lidar),
+                range_min_m=robot.LIDAR_RANGE_MIN_M,
+                range_max_m=robot.LIDAR_RANGE_MAX_M,
+                T_base_lidar=robot.T_BASE_LIDAR,
+            ),
+            encoders=WheelEncoders(
+                stamps_s=self.stamps(self.encoder_times_s),
+                ticks_left=self.counts[:, [1, 3]],
+                ticks_right=self.counts[:, [0, 2]],
+                metres_per_tick=robot.METRES_PER_TICK,
+                track_width_m=robot.TRACK_WIDTH_M,
+            ),
+            imu=Imu(
+                stamps_s=self.stamps(self.imu_times_s),
+                angular_velocity=self.angular_velocity,
+                linear_acceleration=self.acceleration_g * STANDARD_GRAVITY,
+                T_base_imu=np.eye(4),
+            ),
+            rgbd=RgbdFrames(
+                disparity_stamps_s=disparity,
+                colour_stamps_s=colour,
+                disparity_files=(None,) * len(disparity),
+                colour_files=(None,) * len(colour),
+                T_base_camera=robot.T_BASE_CAMERA,
+            ),
+            truth=self.truth(),
+        )
+
 
 def generator(settings: SimulationSettings, purpose: str) -> np.random.Generator:
     """Return the random generator of one part, which does not change when other parts draw more or less."""
@@ -104,39 +142,4 @@ def drive(settings: SimulationSettings, progress: Progress = silent_progress) ->
     The streams are those that reading the folder written by `simulate` gives, for tests and for long logs. Frames:
     truth is T_ref_base at every scan, with the first pose at the origin; accelerations are in m/s^2.
     """
-    run = simulate_run(settings, progress)
-    disparity, colour = run.stamps(run.disparity_times_s), run.stamps(run.colour_times_s)
-    return RobotLog(
-        path=Path(f"simulated-{settings.seed}"),
-        format="simulation",
-        scans=LaserScans(
-            stamps_s=run.stamps(run.lidar_times_s),
-            ranges_m=run.ranges_m,
-            angle_min_rad=robot.LIDAR_ANGLE_MIN_RAD,
-            angle_increment_rad=streams.lidar_increment(settings.lidar),
-            range_min_m=robot.LIDAR_RANGE_MIN_M,
-            range_max_m=robot.LIDAR_RANGE_MAX_M,
-            T_base_lidar=robot.T_BASE_LIDAR,
-        ),
-        encoders=WheelEncoders(
-            stamps_s=run.stamps(run.encoder_times_s),
-            ticks_left=run.counts[:, [1, 3]],
-            ticks_right=run.counts[:, [0, 2]],
-            metres_per_tick=robot.METRES_PER_TICK,
-            track_width_m=robot.TRACK_WIDTH_M,
-        ),
-        imu=Imu(
-            stamps_s=run.stamps(run.imu_times_s),
-            angular_velocity=run.angular_velocity,
-            linear_acceleration=run.acceleration_g * STANDARD_GRAVITY,
-            T_base_imu=np.eye(4),
-        ),
-        rgbd=RgbdFrames(
-            disparity_stamps_s=disparity,
-            colour_stamps_s=colour,
-            disparity_files=(None,) * len(disparity),
-            colour_files=(None,) * len(colour),
-            T_base_camera=robot.T_BASE_CAMERA,
-        ),
-        truth=run.truth(),
-    )
+    return simulate_run(settings, progress).log()
