@@ -54,42 +54,6 @@ def robust_weights(loss: Loss, residual_norms: FloatArray, scale: float) -> Floa
     return _WEIGHTS[loss](residual_norms / scale)
 
 
-def _huber_slope(u: FloatArray) -> FloatArray:
-    return (u <= HUBER_TUNING).astype(np.float64)
-
-
-def _cauchy_slope(u: FloatArray) -> FloatArray:
-    x2 = (u / CAUCHY_TUNING) ** 2
-    return np.asarray((1.0 - x2) / (1.0 + x2) ** 2)
-
-
-def _geman_mcclure_slope(u: FloatArray) -> FloatArray:
-    x2 = (u / GEMAN_MCCLURE_TUNING) ** 2
-    return np.asarray((1.0 - 3.0 * x2) / (1.0 + x2) ** 3)
-
-
-def _tukey_slope(u: FloatArray) -> FloatArray:
-    x2 = np.minimum((u / TUKEY_TUNING) ** 2, 1.0)
-    return np.asarray((1.0 - x2) * (1.0 - 5.0 * x2))
-
-
-_SLOPES: dict[Loss, Callable[[FloatArray], FloatArray]] = {
-    Loss.NONE: _none,
-    Loss.HUBER: _huber_slope,
-    Loss.CAUCHY: _cauchy_slope,
-    Loss.GEMAN_MCCLURE: _geman_mcclure_slope,
-    Loss.TUKEY: _tukey_slope,
-}
-
-
-def influence_slopes(loss: Loss, residual_norms: FloatArray, scale: float) -> FloatArray:
-    """Return the curvature rho''(u) (m,) of the loss at residuals of length `residual_norms` (m,).
-
-    Its mean is the Hessian of a robust cost over that of least squares (Huber 1981, section 7.6); it may be negative.
-    """
-    return _SLOPES[loss](residual_norms / scale)
-
-
 def residual_scale(residual_norms: FloatArray, dimension: int, floor: float) -> float:
     """Estimate the standard deviation of residuals, a component, from the median of their lengths (m,).
 

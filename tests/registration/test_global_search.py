@@ -18,6 +18,7 @@ from posegraph_slam.registration import (
     register_globally,
 )
 from posegraph_slam.registration.fit import measure_fit
+from posegraph_slam.registration.global_search import PreparedTarget
 from posegraph_slam.registration.many_starts import descend_all
 from posegraph_slam.registration.nearest_field import build_nearest_field
 from posegraph_slam.registration.rotation_grid import principal_frame, spread_rotations, yaw_rotations
@@ -48,6 +49,12 @@ def scene() -> tuple[FloatArray, FloatArray]:
     return model, np.vstack([seen, outliers])
 
 
+@pytest.fixture(scope="module")
+def target(scene: tuple[FloatArray, FloatArray]) -> PreparedTarget:
+    """The whole mug, prepared once."""
+    return prepare_target(scene[0], QUICK)
+
+
 def apart(a: FloatArray, b: FloatArray, points: FloatArray) -> tuple[float, float]:
     """Turn and largest shift of the points between two poses."""
     turn = float(np.linalg.norm(SE3.local(a, b)[:3]))
@@ -55,12 +62,14 @@ def apart(a: FloatArray, b: FloatArray, points: FloatArray) -> tuple[float, floa
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_pose_is_found_wherever_the_cloud_is(scene: tuple[FloatArray, FloatArray], seed: int) -> None:
-    model, cloud = scene
+def test_the_pose_is_found_wherever_the_cloud_is(
+    scene: tuple[FloatArray, FloatArray], target: PreparedTarget, seed: int
+) -> None:
+    _, cloud = scene
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     A = SE3.exp(np.r_[rng.uniform(1, 3) * axis / np.linalg.norm(axis), rng.uniform(-2, 2, 3)])
-    found = register_globally(transform_points(A, cloud), model, QUICK)
+    found = register_globally(transform_points(A, cloud), target, QUICK)
     assert found.result.usable
     turn, shift = apart(found.result.T_target_source @ A, np.eye(4), cloud)
     assert turn < np.radians(1.0)
@@ -69,9 +78,8 @@ def test_the_pose_is_found_wherever_the_cloud_is(scene: tuple[FloatArray, FloatA
     assert 0 <= found.start < found.starts == 7 * QUICK.rotations
 
 
-def test_every_second_point_is_enough(scene: tuple[FloatArray, FloatArray]) -> None:
-    model, cloud = scene
-    target = prepare_target(model, QUICK)
+def test_every_second_point_is_enough(scene: tuple[FloatArray, FloatArray], target: PreparedTarget) -> None:
+    _, cloud = scene
     full, half = register_globally(cloud, target, QUICK), register_globally(cloud[::2], target, QUICK)
     turn, shift = apart(full.result.T_target_source, half.result.T_target_source, cloud)
     assert turn < np.radians(0.5)
@@ -103,9 +111,9 @@ def test_yaw_starts_find_an_upright_object(scene: tuple[FloatArray, FloatArray])
     (np.random.default_rng(0).uniform(-1, 1, (500, 3)), RegistrationStatus.TOO_FEW_INLIERS),
 ])  # fmt: skip
 def test_clouds_that_fit_nowhere_end_in_a_status(
-    scene: tuple[FloatArray, FloatArray], points: FloatArray, status: RegistrationStatus
+    target: PreparedTarget, points: FloatArray, status: RegistrationStatus
 ) -> None:
-    found = register_globally(points, scene[0], QUICK)
+    found = register_globally(points, target, QUICK)
     assert found.result.status is status
     assert np.isnan(found.result.T_target_source).all()
     assert found.start == -1
