@@ -24,7 +24,7 @@ from posegraph_slam.pose_graph.robust import RobustLoss, RobustSettings
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, prepare_frame
 
-CAMERA = small_camera(320, 240)
+CAMERA = small_camera(240, 180)
 POSES = loop_through_room(25, turns=1.1)
 """One round and a bit: the last keyframes see what the first ones saw."""
 SOLVER = SolverSettings(robust=RobustSettings(loss=RobustLoss.HUBER))
