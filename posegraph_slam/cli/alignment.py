@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from posegraph_slam.cli.arguments import Json, Quiet, Verbose
+from posegraph_slam.cli.arguments import Json, Overwrite, Quiet, Verbose
 from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table, print_warning
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def icp(
     yaw: Yaw = None,
     rotations: Rotations = 1000,
     keep: Keep = 0.9,
+    overwrite: Overwrite = False,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -51,32 +52,45 @@ def icp(
     A model in millimetres is recognised by its size beside the clouds.
     """
     from posegraph_slam.errors import InputError
-    from posegraph_slam.pipeline.object_poses import align_object, save_objects, task_of_files, tasks_of_folder
+    from posegraph_slam.jit import measure_compile_time
+    from posegraph_slam.pipeline.object_poses import (
+        align_object,
+        require_free_output,
+        save_objects,
+        task_of_files,
+        tasks_of_folder,
+    )
     from posegraph_slam.registration.global_search import GlobalSearchSettings, StartKind
 
     if (folder is None) == (model is None or not clouds):
         raise InputError("psg icp", "needs either MODEL and CLOUD... or --folder", "see psg icp --help")
     if folder is not None and model is not None:
         raise InputError("psg icp", "was given both files and --folder", "give one of them")
+    if out is not None:
+        require_free_output(out, overwrite=overwrite)
     kind = StartKind.ROTATIONS if yaw is None else StartKind.YAW
     # a tilted object is shown as badly as turns about z leave it
     limit = GlobalSearchSettings().rmse_limit_share if yaw is None else 1.0
     settings = GlobalSearchSettings(starts=kind, rotations=yaw or rotations, keep_fraction=keep, rmse_limit_share=limit)
     tasks = tasks_of_folder(folder) if folder is not None else (task_of_files(model, clouds or []),) if model else ()
     began = time.perf_counter()
-    with ProgressBars(enabled=not quiet) as progress:
+    with ProgressBars(enabled=not quiet) as progress, measure_compile_time() as compiling:
         objects = [align_object(task, settings, progress=progress) for task in tasks]
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - began - compiling.seconds
     if out is not None:
         save_objects(objects, out)
         draw_pictures(objects, out)
     poses = [pose for found in objects for pose in found.poses]
+    if not quiet:
+        for remark in (remark for found in objects for remark in found.remarks):
+            print_note(remark)
     if as_json:
         print_json([pose.as_dict() for pose in poses])
     elif not quiet:
         for found in objects:
             print_object(found, settings)
-        typer.echo(f"\n{seconds / len(poses):.1f} s a cloud" + (f"; results in {out}" if out else ""))
+        once = f" and {compiling.seconds:.0f} s once to compile" if compiling.seconds > 1 else ""
+        typer.echo(f"{seconds / len(poses):.1f} s a cloud{once}" + (f"; results in {out}" if out else ""))
     finish(poses)
 
 
@@ -92,26 +106,27 @@ def finish(poses: list[ObjectPose]) -> None:
 def draw_pictures(objects: list[AlignedObject], out: Path) -> None:
     """Draw every aligned cloud over its model."""
     from posegraph_slam.geometry import transform_points
-    from posegraph_slam.pipeline.object_poses import output_path
+    from posegraph_slam.pipeline.object_poses import ALIGNED, aligned_names
     from posegraph_slam.registration.fit import nearest_distances
     from posegraph_slam.report.cloud_overlay import draw_overlay
 
+    names = aligned_names([pose.cloud for found in objects for pose in found.poses])
     for found in objects:
         for pose in found.poses:
             if pose.fit is not None:
                 distance = nearest_distances(pose.points, found.model, pose.T_model_cloud)
                 best, whole = 1000 * pose.fit.trimmed_rmse_m, 1000 * pose.fit.rmse_m
-                title = f"{pose.cloud} on {found.task.name}: RMSE {best:.2f} mm of the best 90 %, {whole:.2f} mm of all"
+                name = names[pose.cloud]
+                title = f"{name.removesuffix(ALIGNED)} on {found.task.name}: "
+                title += f"RMSE {best:.2f} mm of the best 90 %, {whole:.2f} mm of all"
                 placed = transform_points(pose.T_model_cloud, pose.points)
-                draw_overlay(found.model.points, placed, distance, output_path(out, pose.cloud, ".png"), title=title)
+                draw_overlay(found.model.points, placed, distance, out / f"{name}.png", title=title)
 
 
 def print_object(found: AlignedObject, settings: GlobalSearchSettings) -> None:
     """Print the table of one object, and the course report's error beside ours where it has one."""
     from posegraph_slam.pipeline.object_poses import describe_start
 
-    for remark in found.remarks:
-        print_note(remark)
     header = ["cloud", "points", "start", "iterations", "inliers [%]", "RMSE [mm]", "trimmed [mm]", "sum sq [m2]",
               "sum [m]", "status"]  # fmt: skip
     rows = [[p.cloud, str(len(p.points)), describe_start(p.registration, settings),

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, read_only
+from posegraph_slam.datasets.cloud_text import read_text_points
 from posegraph_slam.datasets.pcd import read_pcd
 from posegraph_slam.datasets.ply import read_ply
 from posegraph_slam.errors import InputError
+
+UNREADABLE = (ValueError, TypeError, OSError, EOFError, SyntaxError, TokenError, MemoryError)
+"""What numpy.load raises for files that are damaged or no arrays."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,7 +41,8 @@ def read_cloud(path: Path) -> CloudFile:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(path, f"has the unknown suffix '{path.suffix}'", f"readable are {', '.join(READERS)}")
-    points = np.asarray(reader(path), dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # single precision NaN of every kind become NaN
+        points = np.asarray(reader(path), dtype=np.float64)
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         raise InputError(path, "holds no finite point")
@@ -51,8 +57,8 @@ def is_cloud(path: Path) -> bool:
 def _read_npy(path: Path) -> FloatArray:
     try:
         array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        problem = f"cannot be read as an array ({str(error).splitlines()[0]})"
+    except UNREADABLE as error:
+        problem = f"cannot be read as an array ({[*str(error).splitlines(), type(error).__name__][0]})"
         raise InputError(path, problem, "store the points as one numeric array") from error
     if not isinstance(array, np.ndarray):
         raise InputError(path, "is an archive, not one array", "store the points by numpy.save")
@@ -71,17 +77,6 @@ def _read_mat(path: Path) -> FloatArray:
     return _points_of(next(iter(clouds.values())), path)
 
 
-def _read_text(path: Path) -> FloatArray:
-    separator = "," if path.suffix.lower() == ".csv" else None
-    try:
-        rows = np.loadtxt(path, delimiter=separator, ndmin=2, comments=("#", "//"), encoding="utf-8")
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(path, str(error).splitlines()[0], "give x y z on every line") from error
-    if rows.shape[1] < 3:
-        raise InputError(path, f"has {rows.shape[1]} columns", "give x y z on every line")
-    return rows[:, :3]
-
-
 def _points_of(array: np.ndarray, path: Path) -> FloatArray:
     """Points (n, 3) of an array that holds them as rows or as columns; a 3 x 3 array holds rows."""
     if array.dtype.kind not in "iuf" or array.ndim != 2 or 3 not in array.shape:
@@ -94,8 +89,8 @@ READERS: dict[str, Callable[[Path], FloatArray]] = {
     ".npy": _read_npy,
     ".ply": read_ply,
     ".pcd": read_pcd,
-    ".xyz": _read_text,
-    ".txt": _read_text,
-    ".csv": _read_text,
+    ".xyz": read_text_points,
+    ".txt": read_text_points,
+    ".csv": read_text_points,
 }
 """What reads a suffix; each gives points (n, 3), some of which may not be finite."""

@@ -19,6 +19,7 @@ UNREADABLE = (
     EOFError,
     KeyError,
     IndexError,
+    NameError,  # a header that names an unknown class leaves a variable of SciPy unset
     zlib.error,
 )
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +38,13 @@ MILLIMETRE_RATIOS = (200.0, 5000.0)
 TRIMMED_SHARE = 0.9
 """Share of the points over which the trimmed error is reported, whatever share the search kept."""
 
+MODEL_POINTS_MIN = 10
+"""Fewer bound nothing."""
+
 POSES = "poses.json"
+
+ALIGNED = "_aligned"
+"""Ends the names of clouds that were written, which are no input then."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,7 +118,8 @@ def tasks_of_folder(folder: Path) -> tuple[Task, ...]:
         models = [path for path in files if path.stem == "model"]
         if len(models) > 1:
             raise InputError(place, f"holds {' and '.join(m.name for m in models)}", "keep one model an object")
-        clouds = tuple((path.relative_to(folder).as_posix(), path) for path in files if path not in models)
+        seen = [path for path in files if path not in models and not path.stem.endswith(ALIGNED)]
+        clouds = tuple((path.relative_to(folder).as_posix(), path) for path in seen)
         if models and clouds:
             name = place.name if place != folder else folder.resolve().name
             tasks.append(Task(name=name, model=models[0], clouds=clouds))
@@ -120,8 +129,12 @@ def tasks_of_folder(folder: Path) -> tuple[Task, ...]:
 
 
 def task_of_files(model: Path, clouds: Sequence[Path]) -> Task:
-    """Make the task of one model and some clouds, which go by the paths as they were given."""
-    return Task(name=model.stem, model=model, clouds=tuple((path.as_posix(), path) for path in clouds))
+    """Make the task of one model and some clouds, which go by the paths as they were given.
+
+    A file called `model` takes the name of its folder, as it does in a folder of objects.
+    """
+    name = model.resolve().parent.name if model.stem == "model" else model.stem
+    return Task(name=name, model=model, clouds=tuple((path.as_posix(), path) for path in clouds))
 
 
 def align_object(
@@ -133,6 +146,8 @@ def align_object(
     that fits nowhere keeps its place with a status. Raises `InputError` for files that cannot be read.
     """
     model_file, files = read_cloud(task.model), [read_cloud(path) for _, path in task.clouds]
+    if len(model_file.points) < MODEL_POINTS_MIN:
+        raise InputError(task.model, f"holds {len(model_file.points)} points", "a model needs some hundred at least")
     remarks = [
         f"{file.path}: {file.dropped} points without values left out" for file in [model_file, *files] if file.dropped
     ]
@@ -161,9 +176,14 @@ def _align(
 
 def in_millimetres(model: CloudFile, clouds: Sequence[CloudFile]) -> bool:
     """Whether a model is so large beside its clouds that it is in millimetres."""
-    smallest = float(np.median([side(cloud.points) for cloud in clouds])) if clouds else 0.0
+    middle = float(np.median([inner_side(cloud.points) for cloud in clouds])) if clouds else 0.0
     low, high = MILLIMETRE_RATIOS
-    return smallest > 0 and low < side(model.points) / smallest < high
+    return middle > 0 and low < inner_side(model.points) / middle < high
+
+
+def inner_side(points: FloatArray) -> float:
+    """Longest side of the box around the middle 90 % of points (n, 3) along each axis: a few outliers do not count."""
+    return float(np.ptp(np.quantile(points, [0.05, 0.95], axis=0), axis=0).max())
 
 
 def side(points: FloatArray) -> float:
@@ -181,19 +201,39 @@ def describe_start(registration: GlobalRegistration, settings: GlobalSearchSetti
     return f"{turn} {('mid', '+x', '+y', '+z', '-x', '-y', '-z')[shift]}"
 
 
+def require_free_output(folder: Path, *, overwrite: bool) -> None:
+    """Raise `InputError` if `folder` is a file, or holds poses already and these may not be replaced."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "is not a folder", "choose another --out")
+    if (folder / POSES).exists() and not overwrite:
+        raise InputError(folder / POSES, "exists already", "add --overwrite to replace it, or choose another --out")
+
+
 def save_objects(objects: Sequence[AlignedObject], folder: Path) -> None:
     """Write `poses.json` and, for every cloud with a pose, the cloud in the model's frame as PLY, in metres."""
-    entries = [pose.as_dict() for found in objects for pose in found.poses]
+    poses = [pose for found in objects for pose in found.poses]
     with replacing(folder / POSES) as temporary:
-        temporary.write_text(json.dumps(entries, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    for found in objects:
-        for pose in found.poses:
-            if pose.fit:
-                write_ply(transform_points(pose.T_model_cloud, pose.points), output_path(folder, pose.cloud, ".ply"))
+        text = json.dumps([pose.as_dict() for pose in poses], indent=1, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+    names = aligned_names([pose.cloud for pose in poses])
+    for pose in poses:
+        if pose.fit:
+            write_ply(transform_points(pose.T_model_cloud, pose.points), folder / f"{names[pose.cloud]}.ply")
 
 
-def output_path(folder: Path, cloud: str, suffix: str) -> Path:
-    """Where the file of a cloud goes: under its own name, made relative, with `_aligned` and a suffix."""
-    parts = [part for part in Path(cloud).with_suffix("").parts if part not in ("/", "..", Path(cloud).anchor)]
-    relative = Path(*parts)
-    return folder / relative.with_name(f"{relative.name}_aligned{suffix}")
+def aligned_names(clouds: Sequence[str]) -> dict[str, str]:
+    """Name, without suffix, of what is written of each cloud: its own relative path with `_aligned`.
+
+    Paths that lead elsewhere (absolute, or upwards) start at the folder that holds all of theirs. Clouds that differ by
+    their suffix alone keep it.
+    """
+    paths = [Path(cloud) for cloud in clouds]
+    if any(path.is_absolute() or ".." in path.parts for path in paths):
+        paths = [Path(os.path.abspath(path)) for path in paths]
+        top = Path(os.path.commonpath([path.parent for path in paths])).parent
+        paths = [path.relative_to(top) for path in paths]
+    files = Counter(path.with_suffix("") for path in {*paths})
+    return {
+        cloud: (path if files[path.with_suffix("")] > 1 else path.with_suffix("")).as_posix() + ALIGNED
+        for cloud, path in zip(clouds, paths, strict=True)
+    }

@@ -46,6 +46,26 @@ def test_a_cloud_is_aligned_drawn_and_tabulated(files: tuple[Path, Path], tmp_pa
     assert len(list((tmp_path / "out").rglob("seen_aligned.ply"))) == 1
 
 
+def test_poses_are_replaced_only_on_demand(files: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "poses.json").write_text("kept")
+    code, _, errors = run(*files, "--rotations", 200, "--out", tmp_path)
+    assert code == 2
+    assert "poses.json: exists already" in errors
+    assert (tmp_path / "poses.json").read_text() == "kept"
+    code, text, _ = run(*files, "--rotations", 200, "--out", tmp_path, "--overwrite")
+    assert code == 0
+    assert "s a cloud" in text
+    assert json.loads((tmp_path / "poses.json").read_text())[0]["status"] == "converged"
+
+
+def test_the_course_reports_error_stands_beside_ours(files: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "drill").mkdir()
+    model = files[0].rename(tmp_path / "drill" / "model.npy")
+    _, text, _ = run(model, files[1], "--rotations", 200)
+    assert "drill (3000 points)" in text
+    assert "the course report: 52.7" in text
+
+
 def test_json_is_all_that_is_printed(files: tuple[Path, Path]) -> None:
     code, text, _ = run(*files, "--rotations", 200, "--json")
     assert code == 0

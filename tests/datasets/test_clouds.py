@@ -132,6 +132,63 @@ def test_files_that_are_no_clouds_are_named(tmp_path: Path, name: str, content: 
     assert name in str(error.value)
 
 
+ROWS = "1 2 3\n4 5 6\n"
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("a.xyz", "# a comment\n// another\n\n" + ROWS + "\n"),
+    ("a.xyz", "x y z\n" + ROWS),
+    ("a.xyz", "id z y x\n7 3 2 1\n8 6 5 4\n"),
+    ("a.xyz", "2\n" + ROWS),
+    ("a.xyz", "2\na title\n" + ROWS),
+    ("a.xyz", ROWS.replace(" ", ",")),
+    ("a.xyz", ROWS.replace(" ", ", ")),
+    ("a.xyz", ROWS.replace(" ", ";")),
+    ("a.xyz", ROWS.replace(" ", "\t")),
+    ("a.xyz", ROWS.replace("\n", " 255 0 0\n")),
+    ("a.xyz", ROWS.replace("\n", "\r\n")),
+    ("a.xyz", "\ufeff" + ROWS),
+    ("a.csv", '"x","y","z"\n' + ROWS.replace(" ", ",")),
+    ("a.csv", ROWS),
+    ("a.txt", "X,Y,Z,intensity\n" + ROWS.replace(" ", ",").replace("\n", ",9\n")),
+])  # fmt: skip
+def test_text_is_read_with_and_without_header(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_bytes(text.encode())
+    cloud = read_cloud(tmp_path / name)
+    np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
+    assert cloud.dropped == 0
+
+
+@pytest.mark.parametrize(("text", "complaint"), [
+    ("", "holds no points"),
+    ("# nothing\n", "holds no points"),
+    ("x y z\n", "no finite point"),
+    ("3\n" + ROWS, "announces 3"),
+    (ROWS + "7 8\n", r"a\.xyz:3: '7 8' gives no point"),
+    (ROWS + "# here\n7 8 word\n", r"a\.xyz:4: '7 8 word' gives no point"),
+    ("0,5 1,5 2,5\n0,5 1,5 2,5\n", r"a\.xyz:1: "),
+    ("one two 3\n" + ROWS, r"a\.xyz:1: "),
+])  # fmt: skip
+def test_text_without_points_is_named_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:
+    (tmp_path / "a.xyz").write_text(text)
+    with pytest.raises(InputError, match=complaint):
+        read_cloud(tmp_path / "a.xyz")
+
+
+@pytest.mark.parametrize("kind", ["npy rows", "xyz", "ply ascii", "ply binary_little_endian", "pcd binary_compressed"])
+def test_damaged_headers_end_in_one_line(tmp_path: Path, kind: str) -> None:
+    path, rng = store(tmp_path, kind), np.random.default_rng(0)
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    for _ in range(80):
+        damaged = content.copy()
+        damaged[rng.integers(0, min(len(damaged), 250), 3)] = rng.integers(0, 256, 3)
+        path.write_bytes(damaged.tobytes())
+        try:
+            assert np.isfinite(read_cloud(path).points).all()
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017
+
+
 def test_objects_are_never_unpickled(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([{"x": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(InputError, match="cannot be read"):

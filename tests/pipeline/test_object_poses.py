@@ -13,7 +13,15 @@ from scipy.io import savemat
 from posegraph_slam.datasets.clouds import read_cloud
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE3, transform_points
-from posegraph_slam.pipeline.object_poses import align_object, output_path, save_objects, task_of_files, tasks_of_folder
+from posegraph_slam.pipeline.object_poses import (
+    align_object,
+    aligned_names,
+    in_millimetres,
+    require_free_output,
+    save_objects,
+    task_of_files,
+    tasks_of_folder,
+)
 from posegraph_slam.registration import GlobalSearchSettings, RegistrationStatus, prepare_target, register_globally
 
 QUICK = GlobalSearchSettings(rotations=200, survivors=(200, 50, 20), candidates=4)
@@ -64,7 +72,7 @@ def test_a_folder_of_objects_is_aligned_and_saved(folder: Path, tmp_path: Path) 
     for entry in entries:
         T = np.array(entry["T_model_cloud"])
         cloud = read_cloud(folder / entry["cloud"]).points
-        aligned = read_cloud(output_path(out, entry["cloud"], ".ply")).points
+        aligned = read_cloud(out / entry["cloud"].replace(".npy", "_aligned.ply")).points
         np.testing.assert_allclose(aligned, transform_points(T, cloud), atol=1e-12)
         assert entry["trimmed_rmse_m"] < 0.006
         assert np.abs(aligned.mean(axis=0) - [0, 0, 0.033]).max() < 0.01
@@ -96,11 +104,59 @@ def test_folders_without_objects_are_refused(tmp_path: Path) -> None:
         tasks_of_folder(tmp_path)
 
 
+@pytest.mark.parametrize(("clouds", "names"), [
+    (["x/0.npy", "x/1.npy"], ["x/0", "x/1"]),
+    (["0.npy", "0.ply", "1.npy"], ["0.npy", "0.ply", "1"]),
+    (["/abs/x/0.npy", "/abs/x/1.npy"], ["x/0", "x/1"]),
+    (["/abs/x/0.npy", "/abs/y/0.npy"], ["abs/x/0", "abs/y/0"]),
+    (["/abs/x/0.npy", "/abs/x/0.npy"], ["x/0", "x/0"]),
+])  # fmt: skip
+def test_outputs_have_names_of_their_own(clouds: list[str], names: list[str]) -> None:
+    assert aligned_names(clouds) == {cloud: f"{name}_aligned" for cloud, name in zip(clouds, names, strict=True)}
+
+
 def test_outputs_stay_in_their_folder(tmp_path: Path) -> None:
-    for cloud in ("/abs/x/0.npy", "../../x/0.npy", "x/0.npy"):
-        path = output_path(tmp_path, cloud, ".ply").resolve()
-        assert path.is_relative_to(tmp_path.resolve())
-        assert path.name == "0_aligned.ply"
+    for name in aligned_names(["../../x/0.npy", "x/0.npy", "/0.npy"]).values():
+        assert (tmp_path / name).resolve().is_relative_to(tmp_path.resolve())
+
+
+def test_what_was_written_is_no_input(folder: Path) -> None:
+    save_objects([align_object(task, QUICK) for task in tasks_of_folder(folder)], folder)
+    assert (folder / "block" / "0_aligned.ply").is_file()
+    assert [name for name, _ in tasks_of_folder(folder)[0].clouds] == ["block/0.npy", "block/1.npy"]
+
+
+def test_poses_are_not_overwritten_unasked(tmp_path: Path) -> None:
+    require_free_output(tmp_path / "new", overwrite=False)
+    require_free_output(tmp_path, overwrite=False)
+    (tmp_path / "poses.json").write_text("[]")
+    with pytest.raises(InputError, match="--overwrite"):
+        require_free_output(tmp_path, overwrite=False)
+    require_free_output(tmp_path, overwrite=True)
+    with pytest.raises(InputError, match="not a folder"):
+        require_free_output(tmp_path / "poses.json", overwrite=True)
+
+
+def test_a_model_file_takes_the_name_of_its_folder(tmp_path: Path) -> None:
+    assert task_of_files(tmp_path / "drill" / "model.mat", []).name == "drill"
+    assert task_of_files(tmp_path / "drill" / "thing.mat", []).name == "thing"
+
+
+def test_models_of_some_points_are_refused_by_name(folder: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "small.npy", np.eye(3))
+    with pytest.raises(InputError, match=r"small\.npy: holds 3 points"):
+        align_object(task_of_files(tmp_path / "small.npy", [folder / "other" / "0.npy"]), QUICK)
+
+
+def test_millimetres_are_recognised_beside_clouds_with_outliers(tmp_path: Path) -> None:
+    rng, files = np.random.default_rng(0), []
+    cloud = wedge(rng, 200)
+    for name, points in (("mm", 1000 * cloud), ("m", cloud), ("far", np.vstack([cloud, [[40.0, -30, 20]] * 20]))):
+        np.save(tmp_path / f"{name}.npy", points)
+        files.append(read_cloud(tmp_path / f"{name}.npy"))
+    assert in_millimetres(files[0], files[1:2])
+    assert in_millimetres(files[0], files[2:])
+    assert not in_millimetres(files[1], files[1:])
 
 
 @pytest.mark.data
