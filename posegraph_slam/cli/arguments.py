@@ -33,6 +33,9 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an ea
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Run directory.")]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random choice.")]
+Workers = Annotated[
+    int | None, typer.Option("--workers", help="Threads where a stage can use several; 0: a core each.")
+]
 
 
 def _tell_at_the_end(context: typer.Context, wanted: bool) -> bool:

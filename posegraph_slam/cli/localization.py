@@ -20,6 +20,7 @@ from posegraph_slam.cli.arguments import (
     Set,
     Topic,
     Verbose,
+    Workers,
     topic_names,
 )
 from posegraph_slam.cli.console import ProgressBars
@@ -45,6 +46,7 @@ def localize(
     log_format: Format = None,
     topic: Topic = None,
     seed: Seed = None,
+    workers: Workers = None,
     page: Page = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -56,7 +58,7 @@ def localize(
     from posegraph_slam.pipeline.localize import run_localization
     from posegraph_slam.report.page import write_report_of
 
-    configuration = load_configuration(config or [], settings or [], seed=seed)
+    configuration = load_configuration(config or [], settings or [], seed=seed, workers=workers)
     with ProgressBars(enabled=not quiet) as progress:
         summary = run_localization(
             known_map,

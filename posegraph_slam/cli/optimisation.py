@@ -21,6 +21,7 @@ from posegraph_slam.cli.arguments import (
     Set,
     Topic,
     Verbose,
+    Workers,
     topic_names,
 )
 from posegraph_slam.cli.console import ProgressBars, print_table
@@ -35,7 +36,6 @@ Truth = Annotated[Path | None, typer.Option("--truth", help="File of true poses:
 Camera = Annotated[
     Path | None, typer.Option("--camera", help="File of intrinsics for RGB-D images (JSON, or ROS' YAML).")
 ]
-Workers = Annotated[int | None, typer.Option("--workers", help="Threads to use; 0: one a core.")]
 NoLoops = Annotated[bool, typer.Option("--no-loops", help="Close no loops: scan matching alone.")]
 Stages = Annotated[
     str | None, typer.Option("--stages", help="Only these, comma-separated: odometry, matching, graph, maps.")

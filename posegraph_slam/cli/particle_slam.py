@@ -17,6 +17,7 @@ from posegraph_slam.cli.arguments import (
     Set,
     Topic,
     Verbose,
+    Workers,
     topic_names,
 )
 from posegraph_slam.cli.console import ProgressBars, print_table
@@ -34,6 +35,7 @@ def pf_slam(
     log_format: Format = None,
     topic: Topic = None,
     seed: Seed = None,
+    workers: Workers = None,
     page: Page = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -45,7 +47,7 @@ def pf_slam(
     from posegraph_slam.pipeline.particle_slam import run_particle_slam
     from posegraph_slam.report.page import write_report_of
 
-    configuration = load_configuration(config or [], settings or [], seed=seed)
+    configuration = load_configuration(config or [], settings or [], seed=seed, workers=workers)
     with ProgressBars(enabled=not quiet) as progress:
         summary = run_particle_slam(
             log,

@@ -79,7 +79,8 @@ def test_workers_and_repetition_change_no_byte(walk: Path, tracked: Path, tmp_pa
     x, y, yaw = start_of(walk)
     out = tmp_path / "again"
     invoke("localize", str(walk.with_name("map.yaml")), str(walk), "--out", str(out), "--start", f"{x},{y},{yaw}",
-           "--set", "workers=2")  # fmt: skip
+           "--workers", "2")  # fmt: skip
+    assert "workers = 2\n" in (out / "config.toml").read_text()
     for name in SAME_BYTES:
         assert (out / name).read_bytes() == (tracked / name).read_bytes(), name
 
@@ -135,12 +136,22 @@ def test_maps_of_particles_and_filled_polygons_exclude_each_other(walk: Path, tm
 def test_pf_slam_maps_and_compares(walk: Path, tmp_path: Path) -> None:
     runs = [tmp_path / "one", tmp_path / "two"]
     for run, workers in zip(runs, (1, 2), strict=True):
-        invoke("pf-slam", str(walk), "--out", str(run), "--set", f"workers={workers}", "--seed", "3")
+        invoke("pf-slam", str(walk), "--out", str(run), "--workers", str(workers), "--seed", "3")
+        assert f"workers = {workers}\n" in (run / "config.toml").read_text()
     metrics = json.loads((runs[0] / "metrics.json").read_text())
     rows = {row["metric"]: row["values"] for row in metrics["table"]["rows"]}
     assert rows["APE position RMSE"]["particle filter"] < 0.05
     for name in ("trajectory.tum", "maps/map.pgm", "maps/map.npz", "metrics.json"):
         assert (runs[0] / name).read_bytes() == (runs[1] / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("command", ["pf-slam", "localize"])
+def test_a_bad_number_of_workers_is_one_line(walk: Path, tmp_path: Path, command: str) -> None:
+    inputs = [str(walk.with_name("map.yaml"))] if command == "localize" else []
+    result = CliRunner().invoke(app, [command, *inputs, str(walk), "--out", str(tmp_path / "run"), "--workers", "-1"])
+    assert result.exit_code == 2
+    assert "--workers" in result.output
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("start", ["1,2", "1,2,x", "1,2,nan"])
