@@ -55,9 +55,15 @@ class Cloud:
 def prepare_cloud(points: FloatArray, *, neighbours: int = 10) -> Cloud:
     """Build the KD-tree of points (n, 2) or (n, 3), to whose `neighbours` nearest lines or planes will be fitted.
 
-    Raises `InputError` if the array has another shape or holds values that are not finite.
+    Raises `InputError` if the array has another shape or holds values that are not finite numbers.
     """
-    checked = read_only(points)
+    try:
+        given = np.asarray(points)
+    except ValueError as error:
+        raise InputError("point set", "has rows of unlike lengths", "give an array of numbers") from error
+    if given.dtype.kind not in "iuf":
+        raise InputError("point set", f"holds {given.dtype}", "give an array of numbers")
+    checked = read_only(given)
     if checked.ndim != 2 or checked.shape[1] not in (2, 3):
         raise InputError("point set", f"has shape {checked.shape}", "give an array (points, 2) or (points, 3)")
     padded, finite, spans = prepare_points(checked)

@@ -20,7 +20,7 @@ from posegraph_slam.registration.correlative import (
     max_pooled,
     rotated_cells,
 )
-from posegraph_slam.registration.icp import failed, icp
+from posegraph_slam.registration.icp import checked_pose, failed, icp
 from posegraph_slam.registration.result import RegistrationResult, RegistrationStatus
 from posegraph_slam.registration.settings import IcpSettings
 from posegraph_slam.settings import Settings
@@ -72,13 +72,13 @@ def match_correlatively(
 
     The best pose of the grid is refined by the closest point loop, from which status, information and free directions
     come. A window in which no pose scores `score_min` ends in TOO_FEW_INLIERS; poor clouds end as they do in `icp`.
-    Raises `InputError` for points that are not in the plane and for a guess that is not finite.
+    Raises `InputError` for points that are not in the plane and for a guess that is no finite pose.
     """
     source, target = (c if isinstance(c, Cloud) else prepare_cloud(c) for c in (source, target))
-    guess = np.asarray(T_target_source, dtype=np.float64)
-    if source.dimension != 2 or target.dimension != 2 or guess.shape != (3, 3) or not np.isfinite(guess).all():
-        problem = f"{source.dimension}D and {target.dimension}D points and a guess of shape {guess.shape}"
-        raise InputError("correlative matching", problem, "give planar points and a finite 3 x 3 pose")
+    if source.dimension != 2 or target.dimension != 2:
+        problem = f"{source.dimension}D and {target.dimension}D points"
+        raise InputError("correlative matching", problem, "give planar points")
+    guess = checked_pose(T_target_source, source, target)
     if min(len(source), len(target)) < settings.refinement.min_inliers:
         return failed(RegistrationStatus.TOO_FEW_POINTS, 2)
     if not (source.spans_plane and target.spans_plane):

@@ -9,6 +9,7 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3
+from posegraph_slam.jit import kernel
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
 from posegraph_slam.registration.compiled_loop import (
     CONVERGED,
@@ -37,6 +38,9 @@ STATUSES = {
 }
 FAILURES = (RegistrationStatus.TOO_FEW_INLIERS, RegistrationStatus.DEGENERATE)
 
+RIGID_TOLERANCE = 2e-3
+"""How far the axes of a guess may be from unit length and right angles."""
+
 NO_NORMALS = read_only(np.zeros((1, 3)))
 NO_SURFACE = Surface(
     anchors=NO_NORMALS, normals=NO_NORMALS, oriented=np.zeros(1, dtype=np.bool_), thickness_m=np.zeros(1),
@@ -56,11 +60,12 @@ def icp(
     Either set may be an array or a `Cloud` prepared once for several matches. Each round pairs the points, drops
     pairs, weighs the rest and takes one step; it ends when a step turns and moves less than the tolerances. Points
     too few, on one spot or one line, or without overlap end in a status; then the transform is NaN and the
-    information zero. Raises `InputError` on shapes that do not fit and on values that are not finite.
+    information zero. Raises `InputError` on shapes that do not fit, values that are not finite, and a guess that is
+    no rigid motion.
     """
     source = _prepared(source, settings)
     target = _prepared(target, settings)
-    T = _checked_pose(T_target_source, source, target)
+    T = checked_pose(T_target_source, source, target)
     if min(len(source), len(target)) < settings.min_inliers:
         return failed(RegistrationStatus.TOO_FEW_POINTS, source.dimension)
     if not (source.spans_plane and target.spans_plane):
@@ -175,16 +180,46 @@ def _prepared(cloud: FloatArray | Cloud, settings: IcpSettings) -> Cloud:
     return cloud if isinstance(cloud, Cloud) else prepare_cloud(cloud, neighbours=settings.normal_neighbours)
 
 
-def _checked_pose(T_target_source: FloatArray, source: Cloud, target: Cloud) -> FloatArray:
-    """Return the guess if it fits both clouds."""
+def checked_pose(T_target_source: FloatArray, source: Cloud, target: Cloud) -> FloatArray:
+    """Return the guess (d+1, d+1) if it fits both clouds and is a rigid motion.
+
+    A Gauss-Newton loop that starts at a reflection or a scaling would end at one.
+    """
     if source.dimension != target.dimension:
         raise InputError("registration", f"source points have {source.dimension} coordinates, target points "
                          f"{target.dimension}", "give both in the plane or both in space")  # fmt: skip
-    T, size = np.asarray(T_target_source, dtype=np.float64), source.dimension + 1
+    # always a new array in C order: kernels are compiled anew for every other layout
+    T, size = np.array(T_target_source, dtype=np.float64, order="C"), source.dimension + 1
     if T.shape != (size, size) or not np.isfinite(T).all():
         problem = f"the initial T_target_source of shape {T.shape} is not a finite pose of {source.dimension}D points"
         raise InputError("registration", problem, f"give a {size} x {size} matrix")
+    if not is_rigid(T):
+        problem = "the initial T_target_source is no rigid motion: it scales, shears or reflects"
+        raise InputError("registration", problem, "give a rotation and a translation")
     return T
+
+
+@kernel
+def is_rigid(T: FloatArray) -> bool:
+    """Whether T (d+1, d+1), d = 2 or 3, is a rotation and a translation to three digits, as text files may hold it."""
+    d = len(T) - 1
+    for a in range(d):
+        for b in range(d):
+            product = -1.0 if a == b else 0.0
+            for c in range(d):
+                product += T[c, a] * T[c, b]
+            if abs(product) > RIGID_TOLERANCE:
+                return False
+        if T[d, a] != 0.0:
+            return False
+    if d == 2:
+        return bool(T[0, 0] * T[1, 1] > T[0, 1] * T[1, 0] and T[2, 2] == 1.0)
+    across = (
+        T[0, 0] * (T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1])
+        + T[0, 1] * (T[1, 2] * T[2, 0] - T[1, 0] * T[2, 2])
+        + T[0, 2] * (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0])
+    )
+    return bool(across > 0.0 and T[3, 3] == 1.0)
 
 
 def _source_normals(source: Cloud, settings: IcpSettings) -> FloatArray:

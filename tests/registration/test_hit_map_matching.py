@@ -85,8 +85,9 @@ def test_recovers_a_pose_within_a_step(seed):
     T_robot_map = np.linalg.inv(pose_from_xyt(true))
     points = transform_points(T_robot_map, room(rng)) + rng.normal(0, 0.005, (700, 2))
     found = match_on_hits(points, hit_map, np.zeros(3))
-    assert np.abs(found.xyt[:2] - true[:2]).max() < 0.04
-    assert abs(found.xyt[2] - true[2]) < np.radians(0.6)
+    # a cell of 0.05 m holds the same hits wherever the point lies in it, and the prior pulls: 0.046 m over 1500 seeds
+    assert np.abs(found.xyt[:2] - true[:2]).max() < REPORT.coarse.step_m
+    assert abs(found.xyt[2] - true[2]) < REPORT.coarse.step_rad
     assert found.matched_fraction > 0.6
 
 

@@ -19,6 +19,7 @@ from posegraph_slam.registration import (
     icp,
     prepare_cloud,
 )
+from posegraph_slam.registration.compiled_loop import register
 
 POINT, PLANE = ResidualKind.POINT_TO_POINT, ResidualKind.POINT_TO_PLANE
 matchers = pytest.mark.parametrize(
@@ -242,6 +243,18 @@ def test_the_compiled_loop_is_the_loop_of_parts(group: Group, residual: Residual
     assert (compiled.status, compiled.iterations, compiled.inliers) == (parts.status, parts.iterations, parts.inliers)
     np.testing.assert_allclose(compiled.T_target_source, parts.T_target_source, atol=1e-9)
     np.testing.assert_allclose(compiled.information, parts.information, rtol=1e-5, atol=1e-3)
+
+
+@spaces
+def test_the_layout_of_the_guess_compiles_nothing_anew(group: Group) -> None:
+    target, source, T = surface(group), surface(group, 7), motion(group, 0.05, 1)
+    plain, compiled = icp(source, target, T), len(register.signatures)
+    fixed, wide = T.copy(), np.eye(2 * len(T))
+    fixed.flags.writeable = False
+    wide[: len(T), : len(T)] = T
+    for guess in (fixed, np.asfortranarray(T), wide[: len(T), : len(T)], T.tolist()):
+        assert icp(source, target, guess).T_target_source.tobytes() == plain.T_target_source.tobytes()
+    assert len(register.signatures) == compiled
 
 
 def test_too_few_steps_are_told() -> None:

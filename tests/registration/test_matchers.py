@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 from posegraph_slam.arrays import FloatArray
+from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3, Group, inverse_pose, pose_from_xyt, transform_points
 from posegraph_slam.registration import RegistrationResult, RegistrationStatus
 from posegraph_slam.registration.matchers import available_matchers
 
 CASES = [(2, name) for name in available_matchers(2)] + [(3, name) for name in available_matchers(3)]
 every_matcher = pytest.mark.parametrize(("dimension", "name"), CASES, ids=[f"{d}d-{name}" for d, name in CASES])
+GUIDED = [case for case in CASES if case[1] != "global"]
+matchers_with_a_guess = pytest.mark.parametrize(("dimension", "name"), GUIDED, ids=[f"{d}d-{n}" for d, n in GUIDED])
 
 LOOSE = {"point_to_point": 8.0}
 """How much farther off than the others a matcher may be: raw points of two samples are a grain apart."""
@@ -149,3 +152,23 @@ def test_a_mirrored_cloud_never_yields_a_reflection(dimension: int, name: str, s
         R = result.T_target_source[:-1, :-1]
         assert np.linalg.det(R) == pytest.approx(1.0)
         np.testing.assert_allclose(R @ R.T, np.eye(dimension), atol=1e-9)
+
+
+@matchers_with_a_guess
+@pytest.mark.parametrize("factors", [(-1.0, 1.0), (2.0, 2.0), (1.01, 1.0)], ids=["mirrored", "scaled", "sheared"])
+def test_a_guess_that_is_no_rigid_motion_is_refused(dimension: int, name: str, factors, scenes) -> None:
+    _, target, source, T = scenes[dimension]
+    guess = T @ np.diag(np.r_[factors, np.ones(dimension - 1)])
+    with pytest.raises(InputError, match="no rigid motion"):
+        available_matchers(dimension)[name](source, target, guess)
+
+
+@every_matcher
+def test_arrays_that_hold_no_numbers_are_refused(dimension: int, name: str, scenes) -> None:
+    group, target, source, _ = scenes[dimension]
+    matcher = available_matchers(dimension)[name]
+    for wrong in (source.astype(str), source.astype(object), source + 1j, [[1.0, 2.0], [1.0]], source > 0):
+        with pytest.raises(InputError, match="give an array of numbers"):
+            matcher(wrong, target, group.identity())
+        with pytest.raises(InputError, match="give an array of numbers"):
+            matcher(source, wrong, group.identity())

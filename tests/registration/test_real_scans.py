@@ -15,7 +15,7 @@ pytestmark = pytest.mark.data
 
 
 @pytest.mark.parametrize(("voxel_m", "settings"), [
-    (0.15, IcpSettings.generalised()), (0.25, IcpSettings(max_distance_m=1.0)),
+    (0.15, IcpSettings.generalised()), (0.25, IcpSettings()),
 ], ids=["generalised", "plane"])  # fmt: skip
 def test_the_lidar_pair(psg_data: Path, voxel_m: float, settings: IcpSettings) -> None:
     folder = psg_data / "clouds" / "lidar_pair"
