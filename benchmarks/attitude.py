@@ -3,8 +3,9 @@
     PSG_DATA=folder python benchmarks/attitude.py
 
 Writes benchmarks/results/attitude.json. Speed is CPU time of one core, compiled kernels, over a stream of 200 000
-samples; the time to compile is apart. "left out" runs get the gyro gains that the other runs give by gravity alone,
-starting from the data sheet; "data sheet" runs get none.
+samples; the time to compile is apart. "left out" runs are calibrated by the other runs alone; "data sheet" runs have
+nominal gains, axes and a start that is taken as level; "shifted" gives truth the clock that agrees with the IMU's.
+The row "truth, late" is what a perfect estimate gets from a truth whose clock is off by as much.
 """
 
 from __future__ import annotations
@@ -14,23 +15,30 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
 from posegraph_slam.datasets import read
-from posegraph_slam.datasets.raw_imu import GYRO_GAIN
+from posegraph_slam.datasets.npz import Archive
+from posegraph_slam.datasets.raw_imu import imu_from_counts
 from posegraph_slam.evaluation.attitude import attitude_errors
 from posegraph_slam.files import replacing
+from posegraph_slam.geometry import Trajectory
 from posegraph_slam.jit import measure_compile_time
-from posegraph_slam.odometry.attitude import AttitudeMethod, AttitudeSettings, estimate_attitude, predict, update
-from posegraph_slam.odometry.attitude.calibration import estimate_gyro_gain
+from posegraph_slam.odometry.attitude import (
+    AttitudeMethod,
+    AttitudeSettings,
+    calibrate_against_reference,
+    clock_offset,
+    estimate_attitude,
+    predict,
+    update,
+)
 from posegraph_slam.odometry.attitude.start import find_start
 from posegraph_slam.odometry.attitude.ukf import initial_state, run_ukf
-from posegraph_slam.sensors import Imu, RobotLog
+from posegraph_slam.sensors import Imu
 
 RESULT = Path(__file__).parent / "results" / "attitude.json"
 METHODS: tuple[AttitudeMethod, ...] = ("ukf", "smoother", "complementary", "gyro")
@@ -39,16 +47,16 @@ COLUMNS = ("roll_deg", "pitch_deg", "yaw_deg", "roll_away_deg", "yaw_away_deg", 
            "nees_median")  # fmt: skip
 
 
-def with_gain(imu: Imu, gain: FloatArray) -> Imu:
-    """Scale the rates of an IMU."""
-    return replace(imu, angular_velocity=imu.angular_velocity * gain)
-
-
-def accuracy(log: RobotLog, imu: Imu, method: AttitudeMethod) -> dict[str, Any]:
+def accuracy(imu: Imu, truth: Trajectory, method: AttitudeMethod = "ukf") -> dict[str, Any]:
     """Compare one method with the truth of the run."""
     estimate = estimate_attitude(imu, method=method)
-    assert log.truth is not None
-    return attitude_errors(estimate.trajectory, log.truth, covariance=estimate.covariance).as_dict()
+    return attitude_errors(estimate.trajectory, truth, covariance=estimate.covariance).as_dict()
+
+
+def by_data_sheet(path: Path) -> Imu:
+    """Read a run as one of an unknown board."""
+    archive = Archive(path)
+    return imu_from_counts(archive.numbers("imu_raw"), archive.stamps("imu_stamps_s"), where=str(path), board=None)[0]
 
 
 def per_second(function: Callable[[], Any], count: int, repeats: int = 5) -> float:
@@ -93,27 +101,41 @@ def main() -> int:
     if not folder:
         print("set PSG_DATA to the folder of real logs", file=sys.stderr)
         return 2
-    logs = {path.stem: read(path) for path in sorted((Path(folder) / "orientation").glob("*.npz"))}
-    imus = {name: log.imu for name, log in logs.items() if log.imu is not None}
-    fast = speed(next(iter(imus.values())))
-    plain = {name: with_gain(imu, GYRO_GAIN) for name, imu in imus.items()}
+    paths = sorted((Path(folder) / "orientation").glob("*.npz"))
+    known: dict[str, tuple[Imu, Trajectory]] = {}
+    for path in paths:
+        log = read(path)
+        assert log.imu is not None
+        assert log.truth is not None
+        known[path.stem] = log.imu, log.truth
+    fast = speed(next(iter(known.values()))[0])
     runs: dict[str, Any] = {}
-    for name, log in logs.items():
-        gain, sigma = estimate_gyro_gain([imu for other, imu in plain.items() if other != name])
-        runs[name] = {
-            **{method: accuracy(log, imus[name], method) for method in METHODS},
-            "ukf, left out": accuracy(log, with_gain(plain[name], gain), "ukf"),
-            "ukf, data sheet": accuracy(log, plain[name], "ukf"),
+    for path in paths:
+        imu, truth = known[path.stem]
+        late = clock_offset(imu, truth)
+        shifted = truth.restamped(truth.stamps_s - late)
+        others = [run for name, run in known.items() if name != path.stem]
+        runs[path.stem] = {
+            **{method: accuracy(imu, truth, method) for method in METHODS},
+            "ukf, left out": accuracy(calibrate_against_reference(others).apply(imu), truth),
+            "ukf, data sheet": accuracy(by_data_sheet(path), truth),
+            "ukf, shifted": accuracy(imu, shifted),
+            "truth, late": attitude_errors(shifted, truth).as_dict(),
         }
-        print(f"\n{name}: gains of the other runs {np.round(gain, 3)} +- {np.round(sigma, 3)}")
+        print(f"\n{path.stem}: truth is {1e3 * late:.0f} ms late")
         print(f"{'':<16}" + "".join(f"{column.removesuffix('_deg'):>12}" for column in COLUMNS))
-        for method, errors in runs[name].items():
+        for method, errors in runs[path.stem].items():
             values = (errors[column] for column in COLUMNS)
             print(f"{method:<16}" + "".join(f"{'–' if v is None else format(v, '.2f'):>12}" for v in values))
-    gain, sigma = estimate_gyro_gain(list(plain.values()))
-    print(f"\ngains of all runs {np.round(gain, 3)} +- {np.round(sigma, 3)}")
+    board = calibrate_against_reference(list(known.values()))
+    residual = {
+        "accelerometer_offset": board.accelerometer_offset.tolist(),
+        "accelerometer_matrix": board.accelerometer_matrix.tolist(),
+        "gyro_matrix": board.gyro_matrix.tolist(),
+    }
+    print("\nall runs, what the reader's calibration leaves:", json.dumps(residual))
     print("\n" + "\n".join(f"{name:<22}{value:12.2f}" for name, value in fast.items()))
-    record = {"runs": runs, "speed": fast, "gyro_gain": {"found": gain.tolist(), "sigma": sigma.tolist()}}
+    record = {"runs": runs, "speed": fast, "left_by_the_calibration": residual}
     with replacing(RESULT) as temporary:
         temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     return 0

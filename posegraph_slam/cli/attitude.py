@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +14,9 @@ from posegraph_slam.cli.console import print_json, print_note, print_table
 
 if TYPE_CHECKING:
     from posegraph_slam.evaluation.attitude import AttitudeErrors
+    from posegraph_slam.geometry import Trajectory
     from posegraph_slam.odometry.attitude import AttitudeEstimate
+    from posegraph_slam.sensors import Imu
 
 
 class Method(StrEnum):
@@ -46,7 +49,6 @@ def attitude(
     from posegraph_slam.datasets import read
     from posegraph_slam.datasets.tum import write_tum
     from posegraph_slam.errors import InputError
-    from posegraph_slam.evaluation.attitude import attitude_errors
     from posegraph_slam.odometry.attitude import estimate_attitude
 
     refuse_existing(out, figure, overwrite=overwrite)
@@ -54,11 +56,7 @@ def attitude(
     if log.imu is None:
         raise InputError(run, "holds no IMU", "give a log with gyro and accelerometer")
     estimates = {name: estimate_attitude(log.imu, method=name.value) for name in Method}
-    errors = {
-        name: attitude_errors(each.trajectory, log.truth, covariance=each.covariance)
-        for name, each in estimates.items()
-        if log.truth is not None
-    }
+    comparison = None if log.truth is None else compare(log.imu, estimates, log.truth, written=method)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_tum(estimates[method].trajectory, out)
     if figure is not None:
@@ -68,12 +66,35 @@ def attitude(
         draw_attitude({n.value: estimates[n].trajectory for n in shown}, figure, truth=log.truth, title=run.name)
     remarks = [*log.remarks, *estimates[method].remarks]
     if as_json:
-        print_json(record(out, method, estimates[method], errors=errors, remarks=remarks))
+        print_json(record(out, method, estimates[method], comparison=comparison, remarks=remarks))
     elif not quiet:
-        print_report(errors, remarks)
+        print_report(comparison, remarks)
         typer.echo(f"orientations: {out} ({len(estimates[method])} stamps, {method.value})")
         if figure is not None:
             typer.echo(f"picture:      {figure}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """Errors of each method against the truth, and of the written one against truth on the clock of the IMU."""
+
+    errors: dict[Method, AttitudeErrors]
+    truth_late_s: float
+    on_imu_clock: AttitudeErrors
+
+
+def compare(imu: Imu, estimates: dict[Method, AttitudeEstimate], truth: Trajectory, *, written: Method) -> Comparison:
+    """Compare all estimates with the truth, and the written one also where the rates say that the clocks agree."""
+    from posegraph_slam.evaluation.attitude import attitude_errors
+    from posegraph_slam.odometry.attitude import clock_offset
+
+    def errors(name: Method, reference: Trajectory) -> AttitudeErrors:
+        return attitude_errors(estimates[name].trajectory, reference, covariance=estimates[name].covariance)
+
+    table = {name: errors(name, truth) for name in estimates}
+    late_s = clock_offset(imu, truth)
+    shifted = truth.restamped(truth.stamps_s - late_s)
+    return Comparison(errors=table, truth_late_s=late_s, on_imu_clock=errors(written, shifted))
 
 
 def refuse_existing(*paths: Path | None, overwrite: bool) -> None:
@@ -92,7 +113,7 @@ def record(
     method: Method,
     estimate: AttitudeEstimate,
     *,
-    errors: dict[Method, AttitudeErrors],
+    comparison: Comparison | None,
     remarks: list[str],
 ) -> dict[str, Any]:
     """Return what --json prints."""
@@ -102,19 +123,25 @@ def record(
         "stamps": len(estimate),
         "gyro_bias_rad_s": [float(value) for value in estimate.gyro_bias[-1]],
         "accelerometer_used_share": estimate.corrected_share if estimate.covariance is not None else None,
-        "errors": {name.value: each.as_dict() for name, each in errors.items()},
+        "errors": {name.value: each.as_dict() for name, each in comparison.errors.items()} if comparison else {},
+        "truth_late_s": comparison.truth_late_s if comparison else None,
+        "errors_on_imu_clock": comparison.on_imu_clock.as_dict() if comparison else None,
         "remarks": remarks,
     }
 
 
-def print_report(errors: dict[Method, AttitudeErrors], remarks: list[str]) -> None:
-    """Print remarks to stderr and the table of errors, one row a method."""
+def print_report(comparison: Comparison | None, remarks: list[str]) -> None:
+    """Print remarks to stderr and the table of errors, one row a method and one for truth on the clock of the IMU."""
     for remark in remarks:
         print_note(remark)
-    if not errors:
+    if comparison is None:
         return
-    any_errors = errors[Method.UKF]
-    print_table([["RMSE [deg]", *COLUMNS], *([name.value, *cells(each)] for name, each in errors.items())])
+    any_errors = comparison.errors[Method.UKF]
+    rows = [[name.value, *cells(each)] for name, each in comparison.errors.items()]
+    print_table([["RMSE [deg]", *COLUMNS], *rows, ["on IMU clock", *cells(comparison.on_imu_clock)]])
+    typer.echo(
+        f"on IMU clock: the written estimate against truth whose stamps are {1e3 * comparison.truth_late_s:.0f} ms less"
+    )
     away = f"{1 - any_errors.away_share:.1%}"
     typer.echo(f"{any_errors.count} true stamps; * without the {away} of them with pitch beyond 80 deg\n")
 

@@ -1,36 +1,39 @@
 """From ADC counts to SI units for a six-axis analog IMU board: ADXL335 accelerometer, LPR530AL and LY530ALH gyros.
 
-Channels are Ax Ay Az Wz Wx Wy, converted by a ten-bit ADC of 3.3 V. Zero levels come from the still first seconds, in
-which the board lies level; sensitivities are the data sheets' times the gains of the board below.
+Channels are Ax Ay Az Wz Wx Wy, converted by a ten-bit ADC of 3.3 V. The gyros' zero levels come from the still first
+seconds, sensitivities from the data sheets, and what differs from these on this board from its calibration below.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from posegraph_slam.arrays import BoolArray, FloatArray, read_only
 from posegraph_slam.errors import InputError
-from posegraph_slam.sensors import STANDARD_GRAVITY, Imu
+from posegraph_slam.sensors import STANDARD_GRAVITY, Imu, ImuCalibration
 
 MV_PER_COUNT = 3300.0 / 1023.0
 ACCELEROMETER_MV_PER_G = 330.0
 GYRO_MV_PER_DEG_S = 3.33
 """Data sheets: both sensitivities are ratiometric or amplified, with a tolerance near ten per cent."""
-ACCELEROMETER_GAIN = 1.022
-"""Found from gravity: over the quiet moments of two runs that tilt the board by 90 degrees |a| is 1 g on average."""
-GYRO_GAIN = read_only([1 / 0.909, 1 / 0.939, 1 / 1.047])
-"""x, y, z: found from gravity as the rates under which the vertical, seen from the turning board, stays where it was.
-
-`odometry.attitude.calibration` finds them in three runs, to 0.012, 0.013 and 0.033, and leaving any one run out; truth
-has no part in them.
-"""
 ACCELEROMETER_SIGN = read_only([-1.0, -1.0, 1.0])
 """Ax and Ay count down when the axis points up."""
 MID_SUPPLY = 511.5
 """Data sheet's count of zero acceleration, half the supply; offsets of 0.15 V (46 counts) are within tolerance."""
+BOARD = ImuCalibration(
+    accelerometer_offset=read_only([0.2428, 1.1156, -0.8554]),
+    accelerometer_matrix=read_only([[0.9807, -0.0190, 0.0286], [0.0038, 0.9861, 0.0074], [0.0151, -0.0030, 0.9969]]),
+    gyro_matrix=read_only([[0.9159, -0.0086, 0.0138], [-0.0073, 0.9485, 0.0096], [-0.0097, 0.0028, 1.0364]]),
+)
+"""What `odometry.attitude.calibrate_against_reference` finds for the board in three runs under motion capture.
+
+Two of the runs alone agree to 0.2 % and 0.002 g for the accelerometer and to 1 % for the gyro.
+"""
+BOARD_TOLERANCE = 0.03
+"""At rest the board's calibration gives 1 g within 0.002; another board's offsets and gains would show."""
 GYRO_REFERENCE = 1230.0 / MV_PER_COUNT
 """Count (381.3) of the gyros' reference of 1.23 V, which they put out while they are powered down or being reset."""
 REFERENCE_TOLERANCE = 4.0
@@ -40,63 +43,75 @@ MIN_STILL_S = 0.5
 MAX_STILL_S = 10.0
 STILL_COUNTS = 4.0
 """Still means within this many counts, 4 deg/s or 0.04 g, of the median: five sigma and the odd outlier."""
-MAX_LEVEL_OFFSET = 30.0
-"""Counts (0.29 g) by which a level start may differ from the data sheet."""
+MAX_LEVEL_OFFSET = 0.29 * STANDARD_GRAVITY
+"""m/s^2 by which a level start may differ from the data sheet."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RawCalibration:
-    """Zero counts (3,) of accelerometer and gyro, in x, y, z, and a sentence on how they were found."""
-
-    accelerometer_zero: FloatArray
-    gyro_zero: FloatArray
-    remark: str
-
-
-def imu_from_counts(counts: FloatArray, stamps_s: FloatArray, *, where: str) -> tuple[Imu, tuple[str, ...]]:
+def imu_from_counts(
+    counts: FloatArray, stamps_s: FloatArray, *, where: str, board: ImuCalibration | None = BOARD
+) -> tuple[Imu, tuple[str, ...]]:
     """Convert `counts` (6, N) into an IMU in rad/s and m/s^2, with remarks on what was found.
 
-    Rates are NaN while the gyros put out their reference voltage. Raises `InputError` naming `where` for counts outside
-    0 to 1023 and for a start that is not still.
+    Rates are NaN while the gyros put out their reference voltage. Where `board` does not give 1 g at the start, as on
+    another board, the data sheet's gains are used and the start is taken as level. Raises `InputError` naming `where`
+    for counts outside 0 to 1023 and for a start that is not still.
     """
     outside = (counts < 0) | (counts > 1023)
     if outside.any():
         index = int(np.argmax(outside.any(axis=0)))
         raise InputError(where, f"counts outside 0 to 1023 at index {index}", "expected the raw values of a 10-bit ADC")
-    calibration = calibrate(counts, stamps_s, where=where)
-    accel = (counts[:3].T - calibration.accelerometer_zero) / (_counts_per_g() * ACCELEROMETER_SIGN)
-    rate_scale = np.radians(MV_PER_COUNT / (GYRO_MV_PER_DEG_S * GYRO_GAIN))
-    omega = (counts[[4, 5, 3]].T - calibration.gyro_zero) * rate_scale
+    rest = _rest(counts, stamps_s, where)
+    imu = _by_data_sheet(counts, stamps_s, gyro_zero=counts[3:, rest].mean(axis=1))
+    remark = f"zero rates from a still start of {stamps_s[rest][-1] - stamps_s[0]:.1f} s"
+    force = imu.linear_acceleration[rest].mean(axis=0)
+    if board is not None and _is_one_g(board.accelerometer_matrix @ (force - board.accelerometer_offset)):
+        imu = board.apply(imu)
+    else:
+        imu, how = _level_at_start(imu, force)
+        remark += f"; {how}"
     silent = gyro_outages(counts[3:])
-    omega[silent] = np.nan
-    remarks = [calibration.remark]
-    if silent.any():
-        seconds = float(np.diff(stamps_s, append=stamps_s[-1])[silent].sum())
-        at = float(stamps_s[int(np.argmax(silent))] - stamps_s[0])
-        remarks.append(f"the gyros put out their reference voltage for {seconds:.2f} s, first at {at:.2f} s: no rates")
-    imu = Imu(
-        stamps_s=stamps_s, angular_velocity=omega, linear_acceleration=accel * STANDARD_GRAVITY, T_base_imu=np.eye(4)
-    )
-    return imu, tuple(remarks)
+    if not silent.any():
+        return imu, (remark,)
+    seconds = float(np.diff(stamps_s, append=stamps_s[-1])[silent].sum())
+    at = float(stamps_s[int(np.argmax(silent))] - stamps_s[0])
+    outage = f"the gyros put out their reference voltage for {seconds:.2f} s, first at {at:.2f} s: no rates"
+    rates = np.where(silent[:, None], np.nan, imu.angular_velocity)
+    return replace(imu, angular_velocity=rates), (remark, outage)
 
 
-def calibrate(counts: FloatArray, stamps_s: FloatArray, *, where: str) -> RawCalibration:
-    """Take the zero counts from the still start; the vertical axis is one g above its zero.
-
-    A start that differs from level by more than the data sheet allows leaves the accelerometer at half the supply.
-    """
+def _rest(counts: FloatArray, stamps_s: FloatArray, where: str) -> slice:
+    """Samples of the still start."""
     count = still_start(counts, stamps_s)
     seconds = float(stamps_s[count - 1] - stamps_s[0]) if count else 0.0
     if seconds < MIN_STILL_S:
         problem = f"the board moves from the start (still for {seconds:.2f} s, needed {MIN_STILL_S:g} s)"
         raise InputError(where, problem, "the gyros' zero levels cannot be found: start the log at rest")
-    mean = counts[:, :count].mean(axis=1)
-    zero = mean[:3] - [0.0, 0.0, _counts_per_g()]
-    remark = f"zero levels from a still start of {seconds:.1f} s"
-    if np.abs(zero - MID_SUPPLY).max() > MAX_LEVEL_OFFSET:
-        zero = np.full(3, MID_SUPPLY)
-        remark += "; it is not level, so that the accelerometer's zero is half the supply, good to a few degrees"
-    return RawCalibration(accelerometer_zero=zero, gyro_zero=mean[[4, 5, 3]], remark=remark)
+    return slice(0, count)
+
+
+def _by_data_sheet(counts: FloatArray, stamps_s: FloatArray, *, gyro_zero: FloatArray) -> Imu:
+    """Convert with the data sheets' sensitivities; `gyro_zero` (3,) counts, in the order of the channels."""
+    g = ACCELEROMETER_SIGN * MV_PER_COUNT / ACCELEROMETER_MV_PER_G * (counts[:3].T - MID_SUPPLY)
+    rates = np.radians(MV_PER_COUNT / GYRO_MV_PER_DEG_S) * (counts[3:].T - gyro_zero)
+    return Imu(
+        stamps_s=stamps_s,
+        angular_velocity=rates[:, [1, 2, 0]],
+        linear_acceleration=g * STANDARD_GRAVITY,
+        T_base_imu=np.eye(4),
+    )
+
+
+def _is_one_g(force: FloatArray) -> bool:
+    return bool(abs(float(np.linalg.norm(force)) / STANDARD_GRAVITY - 1.0) < BOARD_TOLERANCE)
+
+
+def _level_at_start(imu: Imu, force: FloatArray) -> tuple[Imu, str]:
+    """Shift accelerations so that their mean at rest, `force` (3,), is 1 g upwards, where the data sheet allows it."""
+    offset = force - [0.0, 0.0, STANDARD_GRAVITY]
+    if np.abs(offset).max() > MAX_LEVEL_OFFSET:
+        return imu, "the start is not level, so that the accelerometer's zero is half the supply, good to a few degrees"
+    shifted = replace(imu, linear_acceleration=imu.linear_acceleration - offset)
+    return shifted, "not the known board, so that the start is taken as level and gains are the data sheet's"
 
 
 def still_start(counts: FloatArray, stamps_s: FloatArray) -> int:
@@ -116,7 +131,3 @@ def gyro_outages(counts: FloatArray) -> BoolArray:
     core = at_reference & (spread <= 2.0).all(axis=0)
     around = maximum_filter1d(core.astype(np.uint8), 2 * OUTAGE_SAMPLES - 1) > 0
     return np.asarray(around & at_reference)
-
-
-def _counts_per_g() -> float:
-    return ACCELEROMETER_MV_PER_G * ACCELEROMETER_GAIN / MV_PER_COUNT

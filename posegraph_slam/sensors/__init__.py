@@ -1,6 +1,6 @@
 """What a robot records and how it is calibrated."""
 
-from posegraph_slam.sensors.imu import STANDARD_GRAVITY, Imu
+from posegraph_slam.sensors.imu import STANDARD_GRAVITY, Imu, ImuCalibration
 from posegraph_slam.sensors.laser import LaserScans
 from posegraph_slam.sensors.rgbd import DisparityCalibration, RgbdFrames
 from posegraph_slam.sensors.rgbd_sequence import PinholeCamera, RgbdSequence
@@ -11,6 +11,7 @@ __all__ = [
     "STANDARD_GRAVITY",
     "DisparityCalibration",
     "Imu",
+    "ImuCalibration",
     "LaserScans",
     "PinholeCamera",
     "RgbdFrames",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.errors import InputError
@@ -36,3 +36,29 @@ class Imu:
 
     def __len__(self) -> int:
         return int(self.stamps_s.shape[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImuCalibration:
+    """Corrections of what an IMU puts out, from its own axes to those of the body it is mounted on.
+
+    The specific force is `accelerometer_matrix` (3, 3) @ (measured - `accelerometer_offset` (3,) m/s^2) and the rate
+    `gyro_matrix` (3, 3) @ measured: gains, axes that are not square, and the mounting. Bias of the gyro is left to the
+    filters.
+    """
+
+    accelerometer_offset: FloatArray
+    accelerometer_matrix: FloatArray
+    gyro_matrix: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("accelerometer_offset", "accelerometer_matrix", "gyro_matrix"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def apply(self, imu: Imu) -> Imu:
+        """Correct rates and accelerations of an IMU."""
+        return replace(
+            imu,
+            angular_velocity=imu.angular_velocity @ self.gyro_matrix.T,
+            linear_acceleration=(imu.linear_acceleration - self.accelerometer_offset) @ self.accelerometer_matrix.T,
+        )

@@ -21,7 +21,7 @@ class AttitudeSettings(Settings):
 
     gyro_noise_rad_per_sqrt_s: float = Field(default=0.005, gt=0, description="rad of sigma after 1 s, white noise")
     gyro_noise_rad_per_sqrt_rad: float = Field(
-        default=0.03, ge=0, description="rad of sigma after turning 1 rad: errors of gain and axes"
+        default=0.02, ge=0, description="rad of sigma after turning 1 rad: errors of gain and axes"
     )
     unknown_rate_rad_per_sqrt_s: float = Field(
         default=0.3, gt=0, description="rad of sigma after 1 s in which the gyro says nothing (NaN, or a gap)"
