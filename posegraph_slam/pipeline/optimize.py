@@ -11,11 +11,9 @@ import numpy as np
 from posegraph_slam.arrays import IntArray
 from posegraph_slam.errors import InputError
 from posegraph_slam.evaluation.summary import TrajectoryMetrics, compare, evaluate_trajectory
-from posegraph_slam.evaluation.tables import ComparisonTable
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
 from posegraph_slam.geometry import SE2, Trajectory
 from posegraph_slam.loop_closure.closing import LoopClosureResult, close_loops
-from posegraph_slam.loop_closure.ledger import LoopRecord, rejected_pairs
 from posegraph_slam.loop_closure.refinement import refine_overlaps
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.mapping.texture import TextureMap
@@ -24,6 +22,7 @@ from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.depth_maps import DepthMaps, build_depth_maps
 from posegraph_slam.pipeline.matching import keyframe_scans, match_log
+from posegraph_slam.pipeline.outcome import JobOutcome
 from posegraph_slam.pipeline.plan_view import PlanView
 from posegraph_slam.pipeline.stage_maps import build_stage_maps
 from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
@@ -35,30 +34,16 @@ STAGES = ("odometry", "scan matching", "optimised")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OptimizationResult:
+class OptimizationResult(JobOutcome):
     """Everything that a run found.
 
-    `stages` maps odometry, scan matching and optimised to their trajectories of all scans (body frame); `matched`
-    says which scans are nodes of `graph`; `loops` records every candidate that was tried; maps are None where they
-    were not asked for.
+    `stages` are odometry, scan matching and optimised, trajectories of the body; `matched` says which scans are nodes
+    of `graph`; maps are None where they were not asked for.
     """
 
-    stages: Mapping[str, Trajectory]
     matched: ScanMatchingResult
-    graph: PoseGraph
-    loops: tuple[LoopRecord, ...]
     occupancy: OccupancyGrid | None
     depth_maps: DepthMaps
-    comparison: ComparisonTable
-    metrics: Mapping[str, Any]
-    stages_s: Mapping[str, float]
-    truth: Trajectory | None
-    remarks: tuple[str, ...]
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """The optimised trajectory, map -> base, a pose for every scan."""
-        return self.stages["optimised"]
 
     @property
     def texture(self) -> TextureMap | None:
@@ -69,11 +54,6 @@ class OptimizationResult:
     def keyframes(self) -> IntArray:
         """Scans (K,) that are nodes of the graph."""
         return self.matched.keyframes
-
-    @property
-    def rejected_pairs(self) -> IntArray:
-        """Target and source keyframe (R, 2) of the candidates that were rejected."""
-        return rejected_pairs(self.loops)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

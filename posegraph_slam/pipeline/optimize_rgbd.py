@@ -16,7 +16,6 @@ from posegraph_slam.evaluation.tables import ComparisonRow, ComparisonTable
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
 from posegraph_slam.geometry import SE3, Trajectory, deform
 from posegraph_slam.loop_closure.closing import LoopClosureResult
-from posegraph_slam.loop_closure.ledger import LoopRecord, rejected_pairs
 from posegraph_slam.loop_closure.rgbd_closing import close_rgbd_loops
 from posegraph_slam.loop_closure.rgbd_views import KeyframeViews
 from posegraph_slam.mapping.colour_cloud import ColourCloud, ColourCloudSettings, fuse_cloud
@@ -24,6 +23,7 @@ from posegraph_slam.mapping.surface_thickness import SurfaceCells, surface_cells
 from posegraph_slam.odometry.rgbd_odometry import RgbdOdometry, track_rgbd
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
+from posegraph_slam.pipeline.outcome import JobOutcome
 from posegraph_slam.pipeline.rgbd_frames import FrameImages, PreparedFrames, chosen_camera
 from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
 from posegraph_slam.pose_graph.solve import solve
@@ -35,42 +35,23 @@ SAMPLED_KEYFRAMES = 150
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RgbdResult:
+class RgbdResult(JobOutcome):
     """Everything that a run of an RGB-D log found.
 
-    `stages` maps odometry and optimised to the camera's trajectory (all frames); `graph` has the keyframes as nodes;
-    `loops` records every candidate. `cloud` is None where maps were not asked for. `upward` (3,) is the direction
-    against gravity in the map frame, as far as floors and tables tell.
+    `stages` are odometry and optimised, trajectories of the camera. `cloud` is None where maps were not asked for.
+    `upward` (3,) is the direction against gravity in the map frame, as far as floors and tables tell.
     """
 
-    stages: Mapping[str, Trajectory]
     odometry: RgbdOdometry
-    graph: PoseGraph
-    loops: tuple[LoopRecord, ...]
     cloud: ColourCloud | None
     samples: Mapping[str, FloatArray]
     """Points (n, 3) of some keyframes, placed by each stage: what the thickness was measured on."""
     upward: FloatArray
-    comparison: ComparisonTable
-    metrics: Mapping[str, Any]
-    stages_s: Mapping[str, float]
-    truth: Trajectory | None
-    remarks: tuple[str, ...]
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """The optimised trajectory, map -> camera, a pose for every frame."""
-        return self.stages["optimised"]
 
     @property
     def keyframes(self) -> IntArray:
         """Frames (K,) that are nodes of the graph."""
         return self.odometry.keyframes
-
-    @property
-    def rejected_pairs(self) -> IntArray:
-        """Target and source keyframe (R, 2) of the candidates that were rejected."""
-        return rejected_pairs(self.loops)
 
 
 def optimize_rgbd(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
 from pathlib import Path
 
 import cv2
@@ -111,23 +110,12 @@ def test_votes_are_those_of_a_slow_count(seed, min_pixels):
     np.testing.assert_array_equal(votes, np.stack([floor, obstacle], axis=-1))
 
 
-class TwoAtATime:
-    """Two workers behind a wall: what goes there and comes back is pickled, and the last piece is done first."""
-
-    workers = 2
-
-    def map(self, function, items):
-        sent = [pickle.dumps((function, item)) for item in items]
-        results = [pickle.dumps(call(item)) for call, item in map(pickle.loads, reversed(sent))]
-        return [pickle.loads(result) for result in reversed(results)]
-
-
-def test_result_does_not_depend_on_the_workers(recorded, geometry, monkeypatch):
+def test_result_does_not_depend_on_the_workers(recorded, geometry, two_at_a_time, monkeypatch):
     monkeypatch.setattr("posegraph_slam.mapping.floor_map.FRAMES_A_PIECE", 1)
     calls = []
     chosen = FloorSettings(method=FloorMethod.PLANE)
     one = build_floor(*recorded, chosen, geometry, progress=lambda *call: calls.append(call))
-    two = build_floor(*recorded, chosen, geometry, executor=TwoAtATime())
+    two = build_floor(*recorded, chosen, geometry, executor=two_at_a_time)
     np.testing.assert_array_equal(one.votes, two.votes)
     assert [call[1:] for call in calls] == [(k, 6) for k in range(1, 7)]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from pathlib import Path
 
 import cv2
@@ -139,22 +138,11 @@ def test_cells_of_the_occupancy_map_are_used_when_given(drive):
     assert np.abs(texture.colour[row, column].astype(int) - tile_colour(np.array(1.25), np.array(0.25))).max() <= 2
 
 
-class TwoAtATime:
-    """Two workers behind a wall: what goes there and comes back is pickled, and the last piece is done first."""
-
-    workers = 2
-
-    def map(self, function, items):
-        sent = [pickle.dumps((function, item)) for item in items]
-        results = [pickle.dumps(call(item)) for call, item in map(pickle.loads, reversed(sent))]
-        return [pickle.loads(result) for result in reversed(results)]
-
-
-def test_result_does_not_depend_on_the_workers(drive, monkeypatch):
+def test_result_does_not_depend_on_the_workers(drive, two_at_a_time, monkeypatch):
     monkeypatch.setattr("posegraph_slam.mapping.texture.FRAMES_A_PIECE", 1)
     calls = []
     one = build_texture(*drive, progress=lambda *call: calls.append(call))
-    two = build_texture(*drive, executor=TwoAtATime())
+    two = build_texture(*drive, executor=two_at_a_time)
     assert (one.colour == two.colour).all()
     assert (one.observed == two.observed).all()
     assert [call[1:] for call in calls] == [(1, 3), (2, 3), (3, 3)]
