@@ -26,7 +26,8 @@ from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGra
 from posegraph_slam.pose_graph.marginals import factored_marginals
 from posegraph_slam.pose_graph.solve import solve
 from posegraph_slam.pose_graph.solver_settings import SolverSettings
-from posegraph_slam.registration.features import match_features, motion_of_matches
+from posegraph_slam.registration.feature_motion import motion_of_matches
+from posegraph_slam.registration.features import match_features
 from posegraph_slam.registration.rgbd_alignment import RgbdAlignment, RgbdAlignmentSettings, align_frames
 from posegraph_slam.settings import Settings
 

@@ -12,7 +12,8 @@ from posegraph_slam.arrays import BoolArray, FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress, split_range
 from posegraph_slam.geometry import SE3, Trajectory, interpolate
-from posegraph_slam.registration.features import Features, detect_features, match_features, motion_of_matches
+from posegraph_slam.registration.feature_motion import motion_of_matches
+from posegraph_slam.registration.features import Features, detect_features, match_features
 from posegraph_slam.registration.rgbd_alignment import RgbdAlignment, RgbdAlignmentSettings, align_frames
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, RgbdReference, prepare_reference
 from posegraph_slam.settings import Settings

@@ -219,7 +219,8 @@ def test_process_imports_nothing_heavy_for_help_and_exits_with_2(tmp_path: Path)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     assert run.stdout.splitlines()[-1] == "[]", run.stderr
     absent = str(tmp_path / "absent")
-    code = f"import sys; sys.argv = ['psg', 'inspect', {absent!r}]\nfrom posegraph_slam.cli import main\nmain()"
+    words = ["psg", "attitude", absent, "--out", "x.tum"]
+    code = f"import sys; sys.argv = {words!r}\nfrom posegraph_slam.cli import main\nmain()"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     assert run.returncode == 2
     assert run.stderr == f"error: {absent}: no such file or folder; check the path\n"

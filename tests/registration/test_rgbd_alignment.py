@@ -14,7 +14,8 @@ from posegraph_slam.datasets.simulation.rgbd_room import (
     small_camera,
 )
 from posegraph_slam.geometry import SE3
-from posegraph_slam.registration.features import detect_features, match_features, motion_of_matches
+from posegraph_slam.registration.feature_motion import motion_of_matches
+from posegraph_slam.registration.features import detect_features, match_features
 from posegraph_slam.registration.result import RegistrationStatus
 from posegraph_slam.registration.rgbd_alignment import RgbdAlignmentSettings, align_frames
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, prepare_frame, prepare_reference
