@@ -8,7 +8,7 @@ the t-distribution of Kerl et al. 2013, hold down what moves, is hidden or refle
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydantic import Field
@@ -16,7 +16,7 @@ from pydantic import Field
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.registration.result import RegistrationStatus
 from posegraph_slam.registration.rgbd_frame import ReferencePoints, RgbdFrame, RgbdReference
-from posegraph_slam.registration.rgbd_kernels import Side, adjoint, align_level, describe_fit, inverse
+from posegraph_slam.registration.rgbd_kernels import Side, adjoint, align_level, describe_fit, inverse, source_update
 from posegraph_slam.settings import Settings
 
 TILES = 8
@@ -37,6 +37,9 @@ class RgbdAlignmentSettings(Settings):
     """Depth is never taken to be better than this share of the sensor's deviation,"""
     least_brightness_sigma: float = Field(default=2.0, gt=0)
     """nor brightness than this, of 255."""
+    inverse_depth_sigma: float = Field(default=0.0, ge=0)
+    """Deviation (1/m) of a smooth error of inverse depth between two frames, which is then estimated with the motion;
+    0 trusts the sensor's calibration. 0.002 is the noise of one pixel of a structured-light sensor."""
     overlap_min: float = Field(default=0.2, ge=0, le=1)
     """Least share of the points that the other frame sees, the larger of both directions."""
     agreement_min: float = Field(default=0.8, ge=0, le=1)
@@ -62,7 +65,8 @@ class RgbdAlignment:
     `information` (6, 6) is in the tangent of the right update T exp(d), [rotation, translation]. `overlap` is the
     share of points that the other frame sees, `agreement` the share on its surface among those not hidden,
     `inlier_fraction` of those within three deviations, `rmse_m` of these, `correlation` of the intensities.
-    `problem` says why it is not usable.
+    `inverse_depth_offsets` (3,) in 1/m are what the source's inverse depth is found to err by against the target's:
+    a + b x/z + c y/z on the target's rays. `problem` says why it is not usable.
     """
 
     T_target_source: FloatArray
@@ -74,10 +78,11 @@ class RgbdAlignment:
     inlier_fraction: float = 0.0
     rmse_m: float = float("nan")
     correlation: float = 0.0
+    inverse_depth_offsets: FloatArray = field(default_factory=lambda: np.zeros(3))
     problem: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("T_target_source", "information"):
+        for name in ("T_target_source", "information", "inverse_depth_offsets"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
@@ -100,7 +105,7 @@ def align_frames(
     back = source if isinstance(source, RgbdReference) else None
     frame = source.frame if isinstance(source, RgbdReference) else source
     T, made, settled = np.array(T_target_source, dtype=np.float64), 0, False
-    floors = np.array([settings.least_depth_sigma, settings.least_brightness_sigma])
+    floors, offsets = _floors(settings), np.zeros(3)
     levels = min(frame.levels, target.frame.levels)
     finest = min(settings.finest_level, levels - 1)
     for level in range(levels - 1, finest - 1, -1):
@@ -109,9 +114,14 @@ def align_frames(
         gate = settings.gate_m * 2.0 ** (level - finest)
         other = _NO_POINTS if back is None else back.points[level]
         side, other_side = _side(target, frame, level), _against(other, target.frame, level)
-        T, done, settled = align_level(side, other_side, T, gate, settings.iterations_max, floors)
+        T, done, settled = align_level(side, other_side, T, offsets, gate, settings.iterations_max, floors)
         made += done
-    return _described(target, frame, back, T, made, settled, finest, settings)
+    return _described(target, frame, back, T, offsets, made, settled, finest, settings)
+
+
+def _floors(settings: RgbdAlignmentSettings) -> FloatArray:
+    """Deviations (3,) that the kernels take: the least ones of depth and of brightness, and that of the offsets."""
+    return np.array([settings.least_depth_sigma, settings.least_brightness_sigma, settings.inverse_depth_sigma])
 
 
 def _side(reference: RgbdReference, frame: RgbdFrame, level: int) -> Side:
@@ -131,22 +141,23 @@ _NO_POINTS = ReferencePoints(
 
 
 def _described(
-    target: RgbdReference, frame: RgbdFrame, back: RgbdReference | None, T: FloatArray, made: int, settled: bool,
-    level: int, settings: RgbdAlignmentSettings,
+    target: RgbdReference, frame: RgbdFrame, back: RgbdReference | None, T: FloatArray, offsets: FloatArray, made: int,
+    settled: bool, level: int, settings: RgbdAlignmentSettings,
 ) -> RgbdAlignment:  # fmt: skip
     """Measure the fit at T on one level and judge it."""
-    floors = np.array([settings.least_depth_sigma, settings.least_brightness_sigma])
-    H, M, measures = describe_fit(_side(target, frame, level), T, settings.gate_m, floors, TILES)
+    floors, gate = _floors(settings), settings.gate_m
+    H, M, measures = describe_fit(_side(target, frame, level), T, False, offsets, gate, floors, TILES)
     all_measures = [measures]
     if back is not None:
         T_back = inverse(T)
         other = _side(back, target.frame, level)
-        H_back, M_back, measures = describe_fit(other, T_back, settings.gate_m, floors, TILES)
-        A = adjoint(T_back)
+        H_back, M_back, measures = describe_fit(other, T_back, True, offsets, gate, floors, TILES)
+        A = source_update(T_back, len(H))
         H, M = H + A.T @ H_back @ A, 2 * (M + A.T @ M_back @ A)  # both directions see the same surfaces
         all_measures.append(measures)
     # from the left update exp(e) T to the right one T exp(d): e = Ad(T) d
-    A = adjoint(T)
+    A = np.eye(len(H))
+    A[:6, :6] = adjoint(T)
     m = np.array(all_measures)
     total = m.sum(axis=0)
     information, weakest_m = _information(A.T @ H @ A, A.T @ M @ A, T, float(total[6]), settings)
@@ -171,7 +182,7 @@ def _described(
     return RgbdAlignment(
         T_target_source=T, information=information, status=status, iterations=made, overlap=overlap,
         agreement=agreement, inlier_fraction=fraction, rmse_m=float(np.sqrt(total[8] / max(total[7], 1))),
-        correlation=correlation, problem=problem,
+        correlation=correlation, inverse_depth_offsets=offsets, problem=problem,
     )  # fmt: skip
 
 
@@ -180,21 +191,23 @@ def _information(
 ) -> tuple[FloatArray, float]:
     """Information (6, 6) and the deviation (m) of the weakest direction, turns counted at one metre.
 
-    The covariance is H^-1 M H^-1 (Huber 1967) with M summed over tiles (Liang and Zeger 1986), plus floors. Residuals
-    that vanish, on a blank wall, would make it small where nothing is known: the weakest direction is judged by H too,
-    with each tile as one measurement.
+    The covariance is H^-1 M H^-1 (Huber 1967) with M summed over tiles (Liang and Zeger 1986), plus floors; that of the
+    offsets of depth is part of it. Residuals that vanish, on a blank wall, would make it small where nothing is known:
+    the weakest direction is judged by H too, with each tile as one measurement.
     """
-    scale = float(np.trace(H)) / 6
+    scale = float(np.trace(H[:6, :6])) / 6
     if not (np.isfinite(H).all() and np.isfinite(M).all() and scale > 0):
         return np.eye(6) * 1e-6, np.inf
-    inverse_H = np.linalg.inv(H + 1e-9 * scale * np.eye(6))
-    covariance = inverse_H @ M @ inverse_H
+    ridge, prior = np.full(len(H), 1e-9 * scale), np.zeros(len(H))
+    prior[6:] = settings.inverse_depth_sigma**-2.0 if len(H) > 6 else 0.0
+    inverse_H = np.linalg.inv(H + np.diag(ridge + prior))
+    covariance = (inverse_H @ (M + np.diag(prior)) @ inverse_H)[:6, :6]
     cosine = np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)
     turn, shift = float(np.arccos(cosine)), float(np.linalg.norm(T[:3, 3]))
     floor = np.repeat([settings.sigma_floor_rad + settings.sigma_share * turn,
                        settings.sigma_floor_m + settings.sigma_share * shift], 3) ** 2  # fmt: skip
     covariance = 0.5 * (covariance + covariance.T) + np.diag(floor)
-    known = inverse_H * max(points / TILES**2, 1.0)
+    known = np.linalg.inv((H + np.diag(ridge)) / max(points / TILES**2, 1.0) + np.diag(prior))[:6, :6]
     weakest = float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], np.linalg.eigvalsh(0.5 * (known + known.T))[-1])))
     information = np.linalg.inv(covariance)
     return 0.5 * (information + information.T), weakest

@@ -12,6 +12,8 @@ from posegraph_slam.jit import kernel
 OUT, UNMEASURED, SEEN, OCCLUDED, INVADES = 0, 1, 2, 3, 4
 """What becomes of a reference point in the source frame: not in view, in view without depth, seen on its surface,
 hidden behind something nearer, or in space that the source saw free."""
+POSE = 6
+"""Unknowns of the pose; three more where offsets of inverse depth are estimated too, see `warp`."""
 MEDIAN_TO_SIGMA = 1.4826
 CAUCHY, CUT = 2.3849, 14.0
 """Scale of the weights in deviations, and where a residual counts no more. On wide pairs Tukey's weights, which end at
@@ -33,15 +35,20 @@ class Side(NamedTuple):
 
 @kernel
 def warp(
-    side: Side, T: FloatArray, gate: float, across: FloatArray, brightness: FloatArray, moved: FloatArray,
-    state: ByteArray,
+    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, across: FloatArray, brightness: FloatArray,
+    moved: FloatArray, levers: FloatArray, state: ByteArray,
 ) -> None:  # fmt: skip
     """Compare reference points with the source frame at T = T_target_source.
 
+    The depth of a structured-light sensor errs smoothly over the image, alike in disparity, which is inverse depth, for
+    near and far (Herrera et al. 2012, Teichman et al. 2013). Between two frames this is taken for a + b x/z + c y/z on
+    the target's rays, source less target, with `offsets` (3,) for a, b, c. `back` says that `side` is the other way
+    round: its points are the source's and its images the target's.
+
     Writes for every point its distance `across` (n,) of the source's surface from the plane of the reference, in
-    deviations of depth (NaN where unknown), the difference of `brightness` (n,) (NaN where unknown), the surface point
-    `moved` (n, 3) in the target frame, and its `state` (n,). Depths further apart than the larger of `gate` and six
-    deviations are no match.
+    deviations of depth (NaN where unknown) with its derivatives `levers` (n, 3) by the offsets, the difference of
+    `brightness` (n,) (NaN where unknown), the surface point `moved` (n, 3) in the target frame, and its `state` (n,).
+    Depths further apart than the larger of `gate` and six deviations are no match.
     """
     points, normals, gradients, intensity, sigma = (
         side.points, side.normals, side.gradients, side.intensity, side.sigma,
@@ -71,6 +78,12 @@ def warp(
             if high - low < 0.03 * low + 0.5 * gate:
                 has_depth = True
                 measured = (1 - b) * ((1 - a) * d00 + a * d01) + b * ((1 - a) * d10 + a * d11)
+                if back:
+                    ray_x, ray_y, sign = (u - cx) / fx, (v - cy) / fy, -1.0
+                else:
+                    ray_x, ray_y, sign = points[k, 0] / points[k, 2], points[k, 1] / points[k, 2], 1.0
+                offset = sign * (offsets[0] + offsets[1] * ray_x + offsets[2] * ray_y)
+                measured = 1.0 / max(1.0 / measured - offset, 0.02)
             else:  # the edge of an object: compare with its nearer side only to tell what is hidden
                 if z > high + allowed:
                     state[k] = OCCLUDED
@@ -87,10 +100,13 @@ def warp(
             for r in range(3):
                 moved[k, r] = T[r, 0] * sx + T[r, 1] * sy + T[r, 2] * measured + T[r, 3]
             if normals[k, 2] != 0.0:
-                gap = 0.0
+                gap, lever = 0.0, 0.0
                 for r in range(3):
                     gap += normals[k, r] * (moved[k, r] - points[k, r])
+                    lever += normals[k, r] * (moved[k, r] - T[r, 3])
                 across[k] = gap / sigma[k]
+                lever *= sign * measured / sigma[k]
+                levers[k, 0], levers[k, 1], levers[k, 2] = lever, lever * ray_x, lever * ray_y
         if gradients[k, 0] != 0.0 or gradients[k, 1] != 0.0:
             value = (1 - b) * ((1 - a) * image[i, j] + a * image[i, j + 1]) + b * (
                 (1 - a) * image[i + 1, j] + a * image[i + 1, j + 1]
@@ -115,14 +131,16 @@ def middle_of(values: FloatArray, about: float, absolute: bool) -> float:
 @kernel
 def normal_equations(
     points: FloatArray, normals: FloatArray, gradients: FloatArray, across: FloatArray, brightness: FloatArray,
-    moved: FloatArray, sigma: FloatArray, scales: FloatArray, H: FloatArray, g: FloatArray,
+    moved: FloatArray, sigma: FloatArray, levers: FloatArray, scales: FloatArray, H: FloatArray, g: FloatArray,
 ) -> float:  # fmt: skip
-    """Add up H (6, 6) and g (6,) for the update exp(e) T, both kinds of residuals under Cauchy's weights.
+    """Add up H (m, m) and g (m,), m = 6 for the update exp(e) T, 9 with the offsets of depth, under Cauchy's weights.
 
-    `scales` is [deviation of `across`, deviation of `brightness`, its offset]. Returns the weighted cost.
+    `levers` (n, 3) is what the offsets add to `across`, `scales` [deviation of `across`, deviation of `brightness`, its
+    offset]. Returns the weighted cost.
     """
     H[:], g[:] = 0.0, 0.0
-    row = np.zeros(6)
+    size = len(g)
+    row = np.zeros(size)
     cost = 0.0
     for k in range(len(points)):
         if across[k] == across[k]:
@@ -135,8 +153,10 @@ def normal_equations(
                 row[1] = moved[k, 2] * nx - moved[k, 0] * nz
                 row[2] = moved[k, 0] * ny - moved[k, 1] * nx
                 row[3], row[4], row[5] = nx, ny, nz
+                for a in range(POSE, size):
+                    row[a] = levers[k, a - POSE] / scales[0]
                 cost += weight * e * e
-                for a in range(6):
+                for a in range(size):
                     g[a] += weight * e * row[a]
                     for b in range(a + 1):
                         H[a, b] += weight * row[a] * row[b]
@@ -155,7 +175,7 @@ def normal_equations(
                     g[a] += weight * e * row[a]
                     for b in range(a + 1):
                         H[a, b] += weight * row[a] * row[b]
-    for a in range(6):
+    for a in range(size):
         for b in range(a):
             H[b, a] = H[a, b]
     return cost
@@ -206,13 +226,30 @@ def inverse(T: FloatArray) -> FloatArray:
 
 
 @kernel
-def linearise(side: Side, T: FloatArray, gate: float, floors: FloatArray, H: FloatArray, g: FloatArray) -> None:
-    """Write H (6, 6) and g (6,) of one frame's points against the other frame, each kind of residual on its scale."""
+def linearise(
+    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, floors: FloatArray, H: FloatArray,
+    g: FloatArray,
+) -> None:  # fmt: skip
+    """Write H (m, m) and g (m,) of one frame's points against the other frame, each kind of residual on its scale."""
     n = len(side.points)
     across, brightness, moved, state = np.empty(n), np.empty(n), np.zeros((n, 3)), np.zeros(n, np.uint8)
-    warp(side, T, gate, across, brightness, moved, state)
+    levers = np.zeros((n, 3))
+    warp(side, T, back, offsets, gate, across, brightness, moved, levers, state)
     scales = residual_scales(across, brightness, floors)
-    normal_equations(side.points, side.normals, side.gradients, across, brightness, moved, side.sigma, scales, H, g)
+    normal_equations(
+        side.points, side.normals, side.gradients, across, brightness, moved, side.sigma, levers, scales, H, g
+    )
+
+
+@kernel
+def source_update(T_source_target: FloatArray, size: int) -> FloatArray:
+    """Map (m, m) from the update of T_target_source to that of its inverse: exp(e) T has T^-1 exp(-e) for inverse.
+
+    This is exp(-Ad(T^-1) e) T^-1. Offsets of depth, if there are any, stay.
+    """
+    A = np.eye(size)
+    A[:POSE, :POSE] = -adjoint(T_source_target)
+    return A
 
 
 @kernel
@@ -227,32 +264,37 @@ def residual_scales(across: FloatArray, brightness: FloatArray, floors: FloatArr
 
 @kernel
 def align_level(
-    side: Side, back: Side, T: FloatArray, gate: float, iterations: int, floors: FloatArray
+    side: Side, back: Side, T: FloatArray, offsets: FloatArray, gate: float, iterations: int, floors: FloatArray
 ) -> tuple[FloatArray, int, bool]:
     """Iterate Gauss-Newton on one level from T; stop when a step moves the view less than a fiftieth of a pixel.
 
     `side` holds the target's points and the source's images, `back` the source's points, none of them to align in one
-    direction, and the target's images. `floors` are the least deviations [of depth in its own
-    deviations, of brightness]. Returns the pose, iterations made, and whether they settled.
+    direction, and the target's images. `offsets` (3,) of inverse depth go in and come out. `floors` are the least
+    deviations [of depth in its own deviations, of brightness] and the deviation of the offsets, 0 to keep them as they
+    are. Returns the pose, iterations made, and whether they settled.
     """
-    H, g, H_back, g_back = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    size = POSE + 3 if floors[2] > 0 else POSE
+    H, g, H_back, g_back = np.zeros((size, size)), np.zeros(size), np.zeros((size, size)), np.zeros(size)
     distance = max(side.points[:, 2].mean(), 0.1)
     fine = 0.02 / side.camera[0]
     for made in range(iterations):
-        linearise(side, T, gate, floors, H, g)
+        linearise(side, T, False, offsets, gate, floors, H, g)
         if len(back.points) > 0:
             T_back = inverse(T)
-            linearise(back, T_back, gate, floors, H_back, g_back)
-            # exp(e) T has the inverse T^-1 exp(-e) = exp(-Ad(T^-1) e) T^-1
-            A = -adjoint(T_back)
+            linearise(back, T_back, True, offsets, gate, floors, H_back, g_back)
+            A = source_update(T_back, size)
             H += A.T @ H_back @ A
             g += A.T @ g_back
-        for a in range(6):
+        for a in range(POSE, size):
+            H[a, a] += floors[2] ** -2.0
+            g[a] += floors[2] ** -2.0 * offsets[a - POSE]
+        for a in range(size):
             H[a, a] += 1e-6 * H[a, a] + 1e-9
         step = np.asarray(-np.linalg.solve(H, g))
         if not np.isfinite(step).all():
             return T, made, False
-        T = left_update(T, step)
+        T = left_update(T, step[:POSE])
+        offsets[: size - POSE] += step[POSE:]
         turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         shift = np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
         if turn < fine and shift < fine * distance:
@@ -262,9 +304,9 @@ def align_level(
 
 @kernel
 def describe_fit(
-    side: Side, T: FloatArray, gate: float, floors: FloatArray, tiles: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return H (6, 6), the sum of outer products of the scores of image tiles (6, 6), and measures of the fit (10,).
+    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, floors: FloatArray, tiles: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Return H (m, m), the sum of outer products of the scores of image tiles (m, m), and measures of the fit (10,).
 
     Residuals of neighbouring pixels are far from independent; those of whole tiles nearly are. The measures count
     points, then those in every state, from OUT to INVADES; then [points with a normal on a surface, those within three
@@ -275,10 +317,12 @@ def describe_fit(
     )  # fmt: skip
     camera, image, n = side.camera, side.image, len(side.points)
     across, brightness, moved, state = np.empty(n), np.empty(n), np.zeros((n, 3)), np.zeros(n, np.uint8)
-    warp(side, T, gate, across, brightness, moved, state)
+    levers = np.zeros((n, 3))
+    warp(side, T, back, offsets, gate, across, brightness, moved, levers, state)
     scales = residual_scales(across, brightness, floors)
-    H, g = np.zeros((6, 6)), np.zeros(6)
-    normal_equations(points, normals, gradients, across, brightness, moved, sigma, scales, H, g)
+    size = POSE + 3 if floors[2] > 0 else POSE
+    H, g = np.zeros((size, size)), np.zeros(size)
+    normal_equations(points, normals, gradients, across, brightness, moved, sigma, levers, scales, H, g)
     measures = np.zeros(10)
     measures[0] = n
     pairs, sum_a, sum_b, sum_aa, sum_bb, sum_ab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -303,7 +347,7 @@ def describe_fit(
         spread = (sum_aa - sum_a * sum_a / pairs) * (sum_bb - sum_b * sum_b / pairs)
         measures[9] = (sum_ab - sum_a * sum_b / pairs) / np.sqrt(spread) if spread > 0 else 0.0
     order = np.argsort(tile, kind="mergesort")
-    M, H_tile, g_tile = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    M, H_tile, g_tile = np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
     start = 0
     while start < n:
         end = start
@@ -311,9 +355,9 @@ def describe_fit(
             end += 1
         rows = order[start:end]
         normal_equations(points[rows], normals[rows], gradients[rows], across[rows], brightness[rows], moved[rows],
-                         sigma[rows], scales, H_tile, g_tile)  # fmt: skip
-        for a in range(6):
-            for b in range(6):
+                         sigma[rows], levers[rows], scales, H_tile, g_tile)  # fmt: skip
+        for a in range(size):
+            for b in range(size):
                 M[a, b] += g_tile[a] * g_tile[b]
         start = end
     return H, M, measures

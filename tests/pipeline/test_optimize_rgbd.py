@@ -137,6 +137,17 @@ def test_five_frames_far_apart_are_placed(psg_data: Path) -> None:
 
 
 @pytest.mark.data
+def test_estimating_the_bend_of_depth_turns_five_frames_right(psg_data: Path) -> None:
+    robot_log = read(psg_data / "rgbd/five_frames")
+    asked = [f"rgbd.{part}.alignment.inverse_depth_sigma=0.002" for part in ("odometry", "loops")]
+    result = optimize_rgbd(robot_log, load_configuration(["default"], [*FIVE_FRAMES, *asked, "maps=false"]))
+    assert robot_log.truth is not None
+    relative = [SE3.between(poses[:1], poses) for poses in (robot_log.truth.poses, result.trajectory.poses)]
+    turns = Rotation.from_matrix((SE3.inverse(relative[0]) @ relative[1])[:, :3, :3]).magnitude()
+    assert np.rad2deg(turns).max() < 1.0
+
+
+@pytest.mark.data
 def test_part_of_the_living_room_is_consistent(psg_data: Path, tmp_path: Path) -> None:
     """Every sixth frame of the first half: out to one side and back over the start."""
     source, folder = psg_data / "rgbd/living_room", tmp_path / "living_room"

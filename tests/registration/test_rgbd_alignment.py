@@ -7,6 +7,7 @@ import pytest
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.datasets.simulation.rgbd_room import (
+    bent_depth,
     furnished_room,
     loop_through_room,
     noisy_depth,
@@ -19,20 +20,23 @@ from posegraph_slam.registration.features import detect_features, match_features
 from posegraph_slam.registration.result import RegistrationStatus
 from posegraph_slam.registration.rgbd_alignment import RgbdAlignmentSettings, align_frames
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, prepare_frame, prepare_reference
-from posegraph_slam.registration.rgbd_kernels import Side, align_level, left_update, linearise
+from posegraph_slam.registration.rgbd_kernels import Side, align_level, left_update, linearise, warp
 
 CAMERA = small_camera(160, 120)
 SETTINGS = RgbdAlignmentSettings()
 POSES = loop_through_room(120)
 
 
-def view(T: FloatArray, *, noise: float = 0.0, seed: int = 0, gain: float = 1.0, camera=CAMERA) -> RgbdFrame:
+def view(
+    T: FloatArray, *, noise: float = 0.0, seed: int = 0, gain: float = 1.0, camera=CAMERA, bend: float = 0.0
+) -> RgbdFrame:
+    """A view of the room whose inverse depth errs by up to `bend` (1/m), from the left border to the right one."""
     rng = np.random.default_rng(seed)
     colour, depth = render_rgbd(furnished_room(seed=3), camera, T)
     if noise > 0:
         colour = np.clip(np.rint(colour + 2 * rng.standard_normal(colour.shape)), 0, 255).astype(np.uint8)
     colour = np.clip(np.rint(gain * colour.astype(float)), 0, 255).astype(np.uint8)
-    units = noisy_depth(depth, camera.depth_units_per_m, rng, noise=noise)
+    units = noisy_depth(bent_depth(depth, bend), camera.depth_units_per_m, rng, noise=noise)
     return prepare_frame(colour, units, camera.vector(), depth_units_per_m=camera.depth_units_per_m, max_depth_m=10.0)
 
 
@@ -63,10 +67,11 @@ def test_a_change_of_exposure_does_not_move_it() -> None:
     assert error(found.T_target_source, truth)[0] < 0.004
 
 
-def test_stated_uncertainty_covers_the_errors_of_noisy_frames() -> None:
+@pytest.mark.parametrize("inverse_depth_sigma", [0.0, 0.002])
+def test_stated_uncertainty_covers_the_errors_of_noisy_frames(inverse_depth_sigma: float) -> None:
     # without the floors for what a simulation does not have: errors of calibration and of exposure
     none = {"sigma_share": 0.0, "sigma_floor_m": 1e-6, "sigma_floor_rad": 1e-6}
-    settings = SETTINGS.model_copy(update=none)
+    settings = SETTINGS.model_copy(update=none | {"inverse_depth_sigma": inverse_depth_sigma})
     squared = []
     for k in range(0, 80, 8):
         target, source = view(POSES[k], noise=1, seed=k), view(POSES[k + 1], noise=1, seed=100 + k)
@@ -133,18 +138,78 @@ def test_the_gradient_vanishes_at_the_truth_and_points_back_beside_it() -> None:
     p, truth = target.points[0], SE3.between(POSES[3], POSES[4])
     side = Side(p.points, p.normals, p.gradients, p.intensity, p.sigma_m,
                 source.intensity[0], source.depth[0], source.camera[0])  # fmt: skip
-    floors, H, g = np.array([0.3, 2.0]), np.zeros((6, 6)), np.zeros(6)
+    floors, offsets, H, g = np.array([0.3, 2.0, 0.0]), np.zeros(3), np.zeros((6, 6)), np.zeros(6)
     rng = np.random.default_rng(0)
     for _ in range(5):
         off = rng.normal(0, 1, 6) * np.array([2e-3] * 3 + [4e-3] * 3)
-        linearise(side, left_update(truth, off), 0.06, floors, H, g)
+        linearise(side, left_update(truth, off), False, offsets, 0.06, floors, H, g)
         step = -np.linalg.solve(H, g)
         # one Gauss-Newton step undoes most of a small displacement
         assert np.linalg.norm(step + off) < 0.5 * np.linalg.norm(off)
     none = Side(*(values[:0] for values in side[:5]), *side[5:])
-    T, _, settled = align_level(side, none, truth, 0.06, 20, floors)
+    T, _, settled = align_level(side, none, truth, offsets, 0.06, 20, floors)
     assert settled
     assert error(T, truth)[0] < 2e-3
+
+
+def test_a_sensor_that_bends_surfaces_is_seen_through_where_that_is_asked_for() -> None:
+    # two units of disparity of a structured-light sensor at either border, of opposite sign
+    asked = SETTINGS.model_copy(update={"inverse_depth_sigma": 0.002})
+    plain, bent = [], []
+    for k in range(0, 100, 20):
+        a, b = (prepare_reference(view(POSES[m], noise=1, seed=m, bend=0.006)) for m in (k, k + 4))
+        truth = SE3.between(POSES[k], POSES[k + 4])
+        trusting, found = align_frames(a, b, truth, SETTINGS), align_frames(a, b, truth, asked)
+        np.testing.assert_array_equal(trusting.inverse_depth_offsets, 0)
+        plain.append(error(trusting.T_target_source, truth))
+        bent.append(error(found.T_target_source, truth))
+        swapped = align_frames(b, a, SE3.inverse(truth), asked)
+        shift, turn = error(found.T_target_source, SE3.inverse(swapped.T_target_source))
+        assert shift < 0.004
+        assert turn < 0.1
+    # texture holds the rotation in both
+    assert np.mean(bent, axis=0)[0] < 0.5 * np.mean(plain, axis=0)[0]
+    assert np.mean(bent, axis=0)[1] < np.mean(plain, axis=0)[1]
+
+
+def test_the_error_of_depth_between_two_frames_is_found() -> None:
+    # the second frame measures everything 0.01 / m too near; its pose is the first one's, so that nothing hides it
+    asked = SETTINGS.model_copy(update={"inverse_depth_sigma": 0.01})
+    a, b = view(POSES[5]), view(POSES[5])
+    nearer = tuple(np.where(d > 0, 1 / (1 / np.maximum(d, 0.1) + 0.01), 0).astype(np.float32) for d in b.depth)
+    b = RgbdFrame(intensity=b.intensity, depth=nearer, camera=b.camera)
+    for source in (b, prepare_reference(b)):
+        found = align_frames(prepare_reference(a), source, np.eye(4), asked)
+        assert found.usable
+        np.testing.assert_allclose(found.inverse_depth_offsets, [0.01, 0, 0], atol=1e-3)
+        assert error(found.T_target_source, np.eye(4))[0] < 2e-3
+    back = align_frames(prepare_reference(b), prepare_reference(a), np.eye(4), asked)
+    np.testing.assert_allclose(back.inverse_depth_offsets, [-0.01, 0, 0], atol=1e-3)
+
+
+def test_derivatives_of_the_offsets_are_those_of_the_distances() -> None:
+    target, source = prepare_reference(view(POSES[3])), prepare_reference(view(POSES[4]))
+    truth = SE3.between(POSES[3], POSES[4])
+    for back in (False, True):
+        points, frame = (source, target.frame) if back else (target, source.frame)
+        p, T = points.points[0], SE3.inverse(truth) if back else truth
+        side = Side(p.points, p.normals, p.gradients, p.intensity, p.sigma_m,
+                    frame.intensity[0], frame.depth[0], frame.camera[0])  # fmt: skip
+        n = len(p)
+
+        def distances(offsets: FloatArray, side=side, T=T, back=back, n=n) -> tuple[FloatArray, FloatArray]:
+            across, levers = np.empty(n), np.zeros((n, 3))
+            warp(side, T, back, offsets, 0.06, across, np.empty(n), np.zeros((n, 3)), levers, np.zeros(n, np.uint8))
+            return across, levers
+
+        at = np.array([1e-3, -2e-3, 1e-3])
+        _, levers = distances(at)
+        for a in range(3):
+            step = np.eye(3)[a] * 1e-5
+            difference = (distances(at + step)[0] - distances(at - step)[0]) / 2e-5
+            known = np.isfinite(difference)
+            assert known.sum() > 1000
+            np.testing.assert_allclose(levers[known, a], difference[known], rtol=1e-4, atol=1e-3)
 
 
 LARGE = small_camera(320, 240)

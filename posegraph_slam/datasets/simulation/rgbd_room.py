@@ -101,6 +101,15 @@ def noisy_depth(depth_m: FloatArray, units_per_m: float, rng: np.random.Generato
     return np.asarray(np.clip(units, 0, 65535), dtype=np.uint16)
 
 
+def bent_depth(depth_m: FloatArray, bend: float) -> FloatArray:
+    """Let inverse depth (h, w) err by -`bend` (1/m) at the left border to `bend` at the right one, as calibration may.
+
+    A unit of disparity of a structured-light sensor, an eighth of a pixel, is 0.003 / m.
+    """
+    error = bend * np.linspace(-1, 1, depth_m.shape[1])
+    return np.asarray(np.where(depth_m > 0, 1 / (1 / np.maximum(depth_m, 0.1) + error), 0.0))
+
+
 def write_rgbd_log(
     folder: Path,
     room: RgbdRoom,
@@ -109,14 +118,18 @@ def write_rgbd_log(
     *,
     noise: float = 1.0,
     colour_noise: float = 2.0,
+    bend: float = 0.0,
     rate_hz: float = 30.0,
 ) -> Path:
-    """Write the frames seen from poses T_world_camera (N, 4, 4): color/, depth/, camera.json and groundtruth.txt."""
+    """Write the frames seen from poses T_world_camera (N, 4, 4): color/, depth/, camera.json and groundtruth.txt.
+
+    `noise` scales that of `noisy_depth`, `bend` is that of `bent_depth`, `colour_noise` a deviation of 255.
+    """
     rng = np.random.default_rng(room.seed + 1)
     for k, T in enumerate(poses):
         colour, depth = render_rgbd(room, camera, T)
         grainy = np.rint(colour + colour_noise * rng.standard_normal(colour.shape))
-        units = noisy_depth(depth, camera.depth_units_per_m, rng, noise=noise)
+        units = noisy_depth(bent_depth(depth, bend), camera.depth_units_per_m, rng, noise=noise)
         _write_png(np.asarray(np.clip(grainy, 0, 255), dtype=np.uint8)[..., ::-1], folder / "color" / f"{k:05d}.png")
         _write_png(units, folder / "depth" / f"{k:05d}.png")
     intrinsics = {
