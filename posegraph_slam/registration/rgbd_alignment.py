@@ -16,7 +16,8 @@ from pydantic import Field
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.registration.result import RegistrationStatus
 from posegraph_slam.registration.rgbd_frame import ReferencePoints, RgbdFrame, RgbdReference
-from posegraph_slam.registration.rgbd_kernels import Side, adjoint, align_level, describe_fit, inverse, source_update
+from posegraph_slam.registration.rgbd_kernels import adjoint, align_level, describe_fit, inverse, source_update
+from posegraph_slam.registration.rgbd_warp import Side
 from posegraph_slam.settings import Settings
 
 TILES = 8

@@ -1,117 +1,19 @@
-"""Kernels of the direct alignment of RGB-D frames: residuals of a pose, and one Gauss-Newton step from them."""
+"""Kernels of the direct alignment of RGB-D frames: Gauss-Newton steps from the residuals of a pose, and its fit."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from posegraph_slam.arrays import ByteArray, Float32Array, FloatArray
+from posegraph_slam.arrays import FloatArray
 from posegraph_slam.jit import kernel
+from posegraph_slam.registration.rgbd_warp import Side, warp
 
-OUT, UNMEASURED, SEEN, OCCLUDED, INVADES = 0, 1, 2, 3, 4
-"""What becomes of a reference point in the source frame: not in view, in view without depth, seen on its surface,
-hidden behind something nearer, or in space that the source saw free."""
 POSE = 6
 """Unknowns of the pose; three more where offsets of inverse depth are estimated too, see `warp`."""
 MEDIAN_TO_SIGMA = 1.4826
 CAUCHY, CUT = 2.3849, 14.0
 """Scale of the weights in deviations, and where a residual counts no more. On wide pairs Tukey's weights, which end at
 4.7, fall into wrong minima: features then miss by 3.3 px where they miss by 2.3 px with these."""
-
-
-class Side(NamedTuple):
-    """Points of one frame (see `ReferencePoints`) and the images of the other, [fx, fy, cx, cy] its camera."""
-
-    points: FloatArray
-    normals: FloatArray
-    gradients: FloatArray
-    intensity: FloatArray
-    sigma: FloatArray
-    image: Float32Array
-    depth: Float32Array
-    camera: FloatArray
-
-
-@kernel
-def warp(
-    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, across: FloatArray, brightness: FloatArray,
-    moved: FloatArray, levers: FloatArray, state: ByteArray,
-) -> None:  # fmt: skip
-    """Compare reference points with the source frame at T = T_target_source.
-
-    The depth of a structured-light sensor errs smoothly over the image, alike in disparity, which is inverse depth, for
-    near and far (Herrera et al. 2012, Teichman et al. 2013). Between two frames this is taken for a + b x/z + c y/z on
-    the target's rays, source less target, with `offsets` (3,) for a, b, c. `back` says that `side` is the other way
-    round: its points are the source's and its images the target's.
-
-    Writes for every point its distance `across` (n,) of the source's surface from the plane of the reference, in
-    deviations of depth (NaN where unknown) with its derivatives `levers` (n, 3) by the offsets, the difference of
-    `brightness` (n,) (NaN where unknown), the surface point `moved` (n, 3) in the target frame, and its `state` (n,).
-    Depths further apart than the larger of `gate` and six deviations are no match.
-    """
-    points, normals, gradients, intensity, sigma = (
-        side.points, side.normals, side.gradients, side.intensity, side.sigma,
-    )  # fmt: skip
-    image, depth = side.image, side.depth
-    fx, fy, cx, cy = side.camera[0], side.camera[1], side.camera[2], side.camera[3]
-    height, width = image.shape
-    for k in range(len(points)):
-        across[k], brightness[k], state[k] = np.nan, np.nan, OUT
-        dx, dy, dz = points[k, 0] - T[0, 3], points[k, 1] - T[1, 3], points[k, 2] - T[2, 3]
-        x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
-        y = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
-        z = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
-        if z < 0.05:
-            continue
-        u, v = fx * x / z + cx, fy * y / z + cy
-        if not (1.0 <= u < width - 2.0 and 1.0 <= v < height - 2.0):
-            continue
-        j, i = int(u), int(v)
-        a, b = u - j, v - i
-        state[k] = UNMEASURED
-        d00, d01, d10, d11 = depth[i, j], depth[i, j + 1], depth[i + 1, j], depth[i + 1, j + 1]
-        low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
-        allowed = max(gate, 6.0 * sigma[k])
-        has_depth = False
-        if low > 0.0:
-            if high - low < 0.03 * low + 0.5 * gate:
-                has_depth = True
-                measured = (1 - b) * ((1 - a) * d00 + a * d01) + b * ((1 - a) * d10 + a * d11)
-                if back:
-                    ray_x, ray_y, sign = (u - cx) / fx, (v - cy) / fy, -1.0
-                else:
-                    ray_x, ray_y, sign = points[k, 0] / points[k, 2], points[k, 1] / points[k, 2], 1.0
-                offset = sign * (offsets[0] + offsets[1] * ray_x + offsets[2] * ray_y)
-                measured = 1.0 / max(1.0 / measured - offset, 0.02)
-            else:  # the edge of an object: compare with its nearer side only to tell what is hidden
-                if z > high + allowed:
-                    state[k] = OCCLUDED
-                continue
-            if measured < z - allowed:
-                state[k] = OCCLUDED
-                continue
-            if measured > z + allowed:
-                state[k] = INVADES
-                continue
-        if has_depth:
-            state[k] = SEEN
-            sx, sy = (u - cx) / fx * measured, (v - cy) / fy * measured
-            for r in range(3):
-                moved[k, r] = T[r, 0] * sx + T[r, 1] * sy + T[r, 2] * measured + T[r, 3]
-            if normals[k, 2] != 0.0:
-                gap, lever = 0.0, 0.0
-                for r in range(3):
-                    gap += normals[k, r] * (moved[k, r] - points[k, r])
-                    lever += normals[k, r] * (moved[k, r] - T[r, 3])
-                across[k] = gap / sigma[k]
-                lever *= sign * measured / sigma[k]
-                levers[k, 0], levers[k, 1], levers[k, 2] = lever, lever * ray_x, lever * ray_y
-        if gradients[k, 0] != 0.0 or gradients[k, 1] != 0.0:
-            value = (1 - b) * ((1 - a) * image[i, j] + a * image[i, j + 1]) + b * (
-                (1 - a) * image[i + 1, j] + a * image[i + 1, j + 1]
-            )
-            brightness[k] = value - intensity[k]
 
 
 @kernel

@@ -20,7 +20,8 @@ from posegraph_slam.registration.features import detect_features, match_features
 from posegraph_slam.registration.result import RegistrationStatus
 from posegraph_slam.registration.rgbd_alignment import RgbdAlignmentSettings, align_frames
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, prepare_frame, prepare_reference
-from posegraph_slam.registration.rgbd_kernels import Side, align_level, left_update, linearise, warp
+from posegraph_slam.registration.rgbd_kernels import align_level, left_update, linearise
+from posegraph_slam.registration.rgbd_warp import Side, warp
 
 CAMERA = small_camera(160, 120)
 SETTINGS = RgbdAlignmentSettings()
