@@ -37,6 +37,8 @@ LAYERS_M = (-0.05, 0.0, 0.05)
 NEIGHBOURS = 10
 ROUNDS = 100
 TOLERANCE = 1e-5
+GATES_M = (0.5, 1.0)
+"""Gates of the planar and the spatial cases; settings are made once, as Open3D's criteria are."""
 
 
 def main() -> None:
@@ -85,11 +87,12 @@ def ours(
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Our loop on prepared clouds, and how to prepare them."""
 
+    by_gate = {gate: IcpSettings(residual=residual, loss=loss, max_distance_m=gate, max_iterations=ROUNDS,
+                                 rotation_tolerance_rad=TOLERANCE, translation_tolerance_m=TOLERANCE,
+                                 uncertainty=uncertainty) for gate in GATES_M}  # fmt: skip
+
     def run(source: Any, target: Any, start: np.ndarray, gate: float) -> np.ndarray:
-        settings = IcpSettings(residual=residual, loss=loss, max_distance_m=gate, max_iterations=ROUNDS,
-                               rotation_tolerance_rad=TOLERANCE, translation_tolerance_m=TOLERANCE,
-                               uncertainty=uncertainty)  # fmt: skip
-        return icp(source, target, start, settings).T_target_source
+        return icp(source, target, start, by_gate[gate]).T_target_source
 
     def prepare(source: np.ndarray, target: np.ndarray) -> tuple[Any, Any]:
         clouds = prepare_cloud(source, neighbours=NEIGHBOURS), prepare_cloud(target, neighbours=NEIGHBOURS)

@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray, read_only
+from posegraph_slam.arrays import FloatArray, frozen, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.jit import kernel
-from posegraph_slam.registration.kd_tree import KdTree, build_kd_tree, in_space
+from posegraph_slam.registration.kd_tree import KdTree, build_kd_tree
 from posegraph_slam.registration.surface import Surface, fit_surface, spans_plane
 
 
@@ -42,11 +42,6 @@ class Cloud:
         return build_kd_tree(self.in_space)
 
     @cached_property
-    def normals_in_space(self) -> FloatArray:
-        """Normals (n, 3) of the surface: those of the plane get a zero."""
-        return in_space(self.surface.normals)
-
-    @cached_property
     def surface(self) -> Surface:
         """Tangent lines or planes at the points."""
         return fit_surface(self.points, self.tree, self.neighbours)
@@ -70,7 +65,7 @@ def prepare_cloud(points: FloatArray, *, neighbours: int = 10) -> Cloud:
     if not finite:
         bad = int(np.count_nonzero(~np.isfinite(checked).all(axis=1)))
         raise InputError("point set", f"{bad} of {len(checked)} points are not finite", "remove them before matching")
-    return Cloud(points=checked, in_space=read_only(padded), spans_plane=spans, neighbours=neighbours)
+    return Cloud(points=checked, in_space=frozen(padded), spans_plane=spans, neighbours=neighbours)
 
 
 @kernel

@@ -59,6 +59,62 @@ def turn_out(A: FloatArray, V: FloatArray, i: int, j: int) -> None:
         A[i, k], A[j, k] = c * A[i, k] - s * A[j, k], s * A[i, k] + c * A[j, k]
 
 
+@kernel
+def cholesky_in_place(A: FloatArray) -> bool:
+    """Write the lower factor of a symmetric matrix (p, p) over its lower half; False if it is not positive definite."""
+    for i in range(len(A)):
+        for j in range(i + 1):
+            rest = A[i, j]
+            for k in range(j):
+                rest -= A[i, k] * A[j, k]
+            if i > j:
+                A[i, j] = rest / A[j, j]
+            elif rest > 0.0:
+                A[i, i] = np.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@kernel
+def inverse_of_positive(matrix: FloatArray) -> tuple[FloatArray, bool]:
+    """Inverse (p, p) of a symmetric matrix, and whether it is positive definite, without which it has none."""
+    p, factor = len(matrix), matrix.copy()
+    inverse, column = np.zeros((p, p)), np.zeros(p)
+    if not cholesky_in_place(factor):
+        return inverse, False
+    for j in range(p):
+        for i in range(p):
+            rest = 1.0 if i == j else 0.0
+            for k in range(i):
+                rest -= factor[i, k] * column[k]
+            column[i] = rest / factor[i, i]
+        for i in range(p - 1, -1, -1):
+            rest = column[i]
+            for k in range(i + 1, p):
+                rest -= factor[k, i] * column[k]
+            column[i] = rest / factor[i, i]
+        for i in range(j + 1):
+            inverse[i, j] = inverse[j, i] = column[i]
+    return inverse, True
+
+
+@kernel
+def congruent(A: FloatArray, V: FloatArray, first: int) -> FloatArray:
+    """Matrix V^T A V (h, h) for A (p, p) and the columns of V (p, p) from `first` on."""
+    p, h = len(A), V.shape[1] - first
+    half, result = np.zeros((p, h)), np.zeros((h, h))
+    for a in range(p):
+        for j in range(h):
+            for b in range(p):
+                half[a, j] += A[a, b] * V[b, first + j]
+    for i in range(h):
+        for j in range(h):
+            for a in range(p):
+                result[i, j] += V[a, first + i] * half[a, j]
+    return result
+
+
 @inline_kernel
 def least_axis_in_plane(xx: float, xy: float, yy: float) -> tuple[float, float, float, float]:
     """Unit eigenvector of the smaller eigenvalue of [[xx, xy], [xy, yy]], and both eigenvalues, rising."""

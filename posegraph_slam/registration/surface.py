@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from posegraph_slam.arrays import BoolArray, FloatArray, IntArray, read_only
-from posegraph_slam.jit import kernel
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray, frozen
+from posegraph_slam.jit import inline_kernel, kernel
+from posegraph_slam.registration.kd_search import neighbours_of_all
 from posegraph_slam.registration.kd_tree import KdTree
+from posegraph_slam.registration.selection import middle_of
 from posegraph_slam.registration.small_matrices import TINY, least_axis_in_plane, least_axis_in_space
 
 LINE_TOLERANCE = 1e-12
@@ -34,22 +36,18 @@ class Surface:
     """Tangent lines (2D) or planes (3D) at the n points of a cloud, each fitted to `neighbours` (n, k), rows of points.
 
     `anchors` (n, d) lie on them, `normals` (n, d) are unit and signless, zero where not `oriented` (n,): fewer than d
-    neighbours, or all on one spot (one line in 3D). `thickness_m` (n,) is the neighbours' standard deviation about
-    the fit, and `trust` (n,) in [0, 1] falls with it: corners and edges of shadows are thick, walls are not.
+    neighbours, or all on one spot (one line in 3D). `normals_in_space` (n, 3) have a zero as third in the plane.
+    `thickness_m` (n,) is the neighbours' standard deviation about the fit, and `trust` (n,) in [0, 1] falls with it:
+    corners and edges of shadows are thick, walls are not.
     """
 
     anchors: FloatArray
     normals: FloatArray
+    normals_in_space: FloatArray
     oriented: BoolArray
     thickness_m: FloatArray
     trust: FloatArray
     neighbours: IntArray
-
-    def __post_init__(self) -> None:
-        for name in ("anchors", "normals", "thickness_m", "trust"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-        object.__setattr__(self, "oriented", read_only(self.oriented, np.bool_))
-        object.__setattr__(self, "neighbours", read_only(self.neighbours, np.int64))
 
 
 def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
@@ -61,38 +59,52 @@ def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
     (1081 beams with 3 cm noise) are doubled, up to four times.
     """
     n, d = points.shape
-    count = min(neighbours, n)
-    if n < d:
-        none = np.zeros((n, 0), dtype=np.int64)
-        return Surface(anchors=points, normals=np.zeros((n, d)), oriented=np.zeros(n, dtype=np.bool_),
-                       thickness_m=np.zeros(n), trust=np.zeros(n), neighbours=none)  # fmt: skip
-    index = tree.neighbours_of_all(count)
-    fit = fit_neighbourhoods(points, index)
+    count = min(neighbours, n) if n >= d else 0
+    anchors, normals, spread, oriented, thickness, trust, index = fit_all(
+        points, tree.rows, tree.sorted_points, tree.axis, tree.value, count)  # fmt: skip
+    return Surface(anchors=frozen(anchors), normals=frozen(normals), normals_in_space=frozen(spread),
+                   oriented=frozen(oriented), thickness_m=frozen(thickness), trust=frozen(trust),
+                   neighbours=frozen(index))  # fmt: skip
+
+
+@kernel
+def fit_all(
+    points: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray, value: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray, IntArray]:
+    """Fit `count` neighbours at every point, in the plane up to four times as many; the fields of a `Surface`."""
+    n, d = points.shape
+    index = neighbours_of_all(rows, leaves, axis, value, count)
+    anchors, normals, oriented, thickness, trust, share = fit_neighbourhoods(points, index)
     for _ in range(MOST_DOUBLINGS if d == 2 else 0):
-        if fit[5] <= THICKEST_SHARE or 2 * count > n:
+        if share <= THICKEST_SHARE or 2 * count > n:
             break
-        wider = tree.neighbours_of_all(2 * count)
+        wider = neighbours_of_all(rows, leaves, axis, value, 2 * count)
         other = fit_neighbourhoods(points, wider)
-        if other[5] > SHARE_GAINED * fit[5]:
+        if other[5] > SHARE_GAINED * share:
             break
-        index, fit, count = wider, other, 2 * count
-    anchors, normals, oriented, thickness, trust, _ = fit
-    return Surface(anchors=anchors, normals=normals, oriented=oriented, thickness_m=thickness, trust=trust,
-                   neighbours=index)  # fmt: skip
+        anchors, normals, oriented, thickness, trust, share = other
+        index, count = wider, 2 * count
+    spread = np.zeros((n, 3))
+    for row in range(n):
+        for a in range(d):
+            spread[row, a] = normals[row, a]
+    return anchors, normals, spread, oriented, thickness, trust, index
 
 
 @kernel
 def fit_neighbourhoods(
     points: FloatArray, neighbours: IntArray
 ) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray, FloatArray, float]:
-    """Anchors and normals (n, d), oriented, thickness and trust (n,) of the points named by rows (n, k).
+    """Anchors and normals (n, d), oriented, thickness and trust (n,) of points fitted to those named by rows (n, k).
 
     Last comes the median thickness of the neighbourhoods over their second longest side, in the plane their length.
     """
     n, k = neighbours.shape
     d = points.shape[1]
-    anchors, normals, share = np.zeros((n, d)), np.zeros((n, d)), np.zeros(n)
+    anchors, normals, share = points.copy(), np.zeros((n, d)), np.zeros(n)
     oriented, thickness, trust = np.zeros(n, dtype=np.bool_), np.zeros(n), np.zeros(n)
+    if k == 0:
+        return anchors, normals, oriented, thickness, trust, 0.0
     some, shares, count = np.empty(n), np.empty(n), 0
     for row in range(n):
         least, second, largest = fit_principal_axes(points, neighbours, row, anchors, normals)
@@ -106,49 +118,48 @@ def fit_neighbourhoods(
         else:
             for a in range(d):
                 normals[row, a] = 0.0
-    usual = np.median(some[:count]) if count > 0 else 0.0
+    usual = middle_of(some, count) if count > 0 else 0.0
     for row in range(n):
         if oriented[row]:
             # a neighbourhood as thick as it is long has no direction
             thick = thickness[row] / max(USUAL_THICKNESSES * usual, THINNEST_M)
             trust[row] = (1.0 - share[row]) / (1.0 + thick * thick)
     return_to_surface(points, neighbours, anchors, normals, trust)
-    return anchors, normals, oriented, thickness, trust, np.sqrt(np.median(shares[:count])) if count > 0 else 0.0
+    return anchors, normals, oriented, thickness, trust, np.sqrt(middle_of(shares, count)) if count > 0 else 0.0
 
 
-@kernel
+@inline_kernel
 def fit_principal_axes(
     points: FloatArray, neighbours: IntArray, row: int, anchors: FloatArray, normals: FloatArray
 ) -> tuple[float, float, float]:
     """Write mean and least principal axis of one neighbourhood; its smallest, second and largest variance."""
     k, d = neighbours.shape[1], points.shape[1]
-    first = neighbours[row, 0]  # coordinates are taken from it: no digits are lost far from the origin
+    first, share = neighbours[row, 0], 1.0 / k  # coordinates are taken from it: no digits are lost far from the origin
     x0, y0, z0 = points[first, 0], points[first, 1], points[first, 2] if d == 3 else 0.0
     x, y, z, xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for j in range(k):
-        at = neighbours[row, j]
-        u, v = points[at, 0] - x0, points[at, 1] - y0
-        x += u
-        y += v
-        xx += u * u
-        xy += u * v
-        yy += v * v
-        if d == 3:
-            w = points[at, 2] - z0
-            z += w
-            xz += u * w
-            yz += v * w
-            zz += w * w
-    x, y, z = x / k, y / k, z / k
-    xx, xy, yy = xx / k - x * x, xy / k - x * y, yy / k - y * y
-    anchors[row, 0], anchors[row, 1] = x0 + x, y0 + y
     if d == 2:
-        normals[row, 0], normals[row, 1], least, largest = least_axis_in_plane(xx, xy, yy)
-        return least, largest, largest
-    anchors[row, 2] = z0 + z
-    xz, yz, zz = xz / k - x * z, yz / k - y * z, zz / k - z * z
-    normals[row, 0], normals[row, 1], normals[row, 2], least, second, largest = least_axis_in_space(
-        xx, xy, xz, yy, yz, zz)  # fmt: skip
+        for j in range(1, k):
+            at = neighbours[row, j]
+            u, v = points[at, 0] - x0, points[at, 1] - y0
+            x, y = x + u, y + v
+            xx, xy, yy = xx + u * u, xy + u * v, yy + v * v
+        x, y = x * share, y * share
+        anchors[row, 0], anchors[row, 1] = x0 + x, y0 + y
+        normals[row, 0], normals[row, 1], least, largest = least_axis_in_plane(
+            xx * share - x * x, xy * share - x * y, yy * share - y * y)  # fmt: skip
+        second = largest
+    else:
+        for j in range(1, k):
+            at = neighbours[row, j]
+            u, v, w = points[at, 0] - x0, points[at, 1] - y0, points[at, 2] - z0
+            x, y, z = x + u, y + v, z + w
+            xx, xy, xz = xx + u * u, xy + u * v, xz + u * w
+            yy, yz, zz = yy + v * v, yz + v * w, zz + w * w
+        x, y, z = x * share, y * share, z * share
+        anchors[row, 0], anchors[row, 1], anchors[row, 2] = x0 + x, y0 + y, z0 + z
+        normals[row, 0], normals[row, 1], normals[row, 2], least, second, largest = least_axis_in_space(
+            xx * share - x * x, xy * share - x * y, xz * share - x * z, yy * share - y * y, yz * share - y * z,
+            zz * share - z * z)  # fmt: skip
     return least, second, largest
 
 
@@ -163,24 +174,30 @@ def return_to_surface(
     count as far as they are trusted and their normals agree: a corner must not be rounded the other way.
     """
     n, k = neighbours.shape
-    d = points.shape[1]
-    offset, shift = np.zeros(n), np.zeros(n)
+    space = points.shape[1] == 3
+    offset, shift = np.empty(n), np.empty(n)
     for row in range(n):
-        for a in range(d):
-            offset[row] += normals[row, a] * (points[row, a] - anchors[row, a])
+        offset[row] = normals[row, 0] * (points[row, 0] - anchors[row, 0])
+        offset[row] += normals[row, 1] * (points[row, 1] - anchors[row, 1])
+        if space:
+            offset[row] += normals[row, 2] * (points[row, 2] - anchors[row, 2])
     for row in range(n):
+        x, y, z = normals[row, 0], normals[row, 1], normals[row, 2] if space else 0.0
         total, mean = 0.0, 0.0
         for j in range(k):
-            at, along = neighbours[row, j], 0.0
-            for a in range(d):
-                along += normals[row, a] * normals[at, a]
+            at = neighbours[row, j]
+            along = x * normals[at, 0] + y * normals[at, 1]
+            if space:
+                along += z * normals[at, 2]
             weight = trust[at] * (along * along) * (along * along)
             total += weight
-            mean += weight * offset[at] * (1.0 if along > 0 else -1.0)
+            mean += weight * (offset[at] if along > 0 else -offset[at])
         shift[row] = mean / max(total, TINY)
     for row in range(n):
-        for a in range(d):
-            anchors[row, a] += shift[row] * normals[row, a]
+        anchors[row, 0] += shift[row] * normals[row, 0]
+        anchors[row, 1] += shift[row] * normals[row, 1]
+        if space:
+            anchors[row, 2] += shift[row] * normals[row, 2]
 
 
 @kernel

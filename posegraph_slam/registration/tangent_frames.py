@@ -6,6 +6,7 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.jit import kernel
+from posegraph_slam.registration.small_matrices import congruent
 
 
 @kernel
@@ -34,7 +35,7 @@ def frame_matrix(d: int, centre: FloatArray, radius: float, forward: bool) -> Fl
 def to_origin(d: int, information: FloatArray, centre: FloatArray, radius: float) -> FloatArray:
     """Information (p, p) of the tangent at the source origin from that of the balanced frame."""
     back = frame_matrix(d, centre, radius, False)
-    result = back.T @ information @ back
+    result = congruent(information, back, 0)
     return (result + result.T) / 2
 
 

@@ -7,10 +7,11 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.jit import kernel
 from posegraph_slam.registration.generalised_metric import metric_of_pair
-from posegraph_slam.registration.robust_steps import GENERALISED, MEDIAN_1, PLANE
-from posegraph_slam.registration.score_products import larger_of, score_products
-from posegraph_slam.registration.small_matrices import TINY, symmetric_eigen
-from posegraph_slam.registration.small_steps import centre_and_radius, robust_slope, robust_weight, tangent_row
+from posegraph_slam.registration.robust_steps import MEDIAN_1, PLANE, POINT
+from posegraph_slam.registration.score_products import at_least_along, larger_of, score_products, weighted_squares
+from posegraph_slam.registration.selection import middle_of
+from posegraph_slam.registration.small_matrices import TINY, congruent, inverse_of_positive, symmetric_eigen
+from posegraph_slam.registration.small_steps import centre_and_radius, robust_slope, robust_weight
 from posegraph_slam.registration.tangent_frames import free_at_origin, gap_between, to_origin
 
 CAUCHY = 2
@@ -39,27 +40,23 @@ def describe_pairs(
     centre, radius = centre_and_radius(source, s, len(s), d)
     jacobian, offset, gaps = linearise_pairs(d, T, centre, radius, source, anchors, normals, s, t)
     weight, slope = weigh_pairs(offset, trust, t, residual, loss, options[2], floor)
-    H = weighted_square(jacobian, weight)
+    H, gradient, scores = weigh_rows(jacobian, offset, weight)
     values, vectors = symmetric_eigen(H)
     free = 0
     while free < len(values) and values[free] <= max(ratio * values[len(values) - 1], TINY):
         free += 1
-    scores = scores_along(jacobian, weight, vectors, free)
-    M = score_products(d, scores, offset, weight, gaps, thickness, anchors, target, normals, neighbours, t, sigma_floor)
-    held = len(values) - free
-    covariance, step = np.zeros((held, held)), np.zeros((held, held))
-    pull, gap = np.zeros(held), gap_between(d, T, reached, centre, radius)
+    M, near = score_products(d, scores, offset, weight, gaps, thickness, anchors, target, normals, neighbours, t,
+                             sigma_floor)  # fmt: skip
+    least_ratio = 1.0 + np.sqrt(2.0 * neighbours.shape[1] / max(len(s), 1))
+    M = larger_of(congruent(M, vectors, free), congruent(near, vectors, free), least_ratio)
+    held, gap = len(values) - free, gap_between(d, T, reached, centre, radius)
+    freedom, pull = len(s) / max(len(s) - held, 1), np.zeros(held)
     for i in range(held):
-        for k in range(len(s)):
-            pull[i] += scores[k, i] * offset[k] / (slope * values[free + i])
         for a in range(len(values)):
-            pull[i] += vectors[a, free + i] * gap[a]
-    freedom = len(s) / max(len(s) - held, 1)
-    for i in range(held):
+            pull[i] += vectors[a, free + i] * (gradient[a] / (slope * values[free + i]) + gap[a])
         for j in range(held):
-            covariance[i, j] = freedom * M[i, j] / (slope * slope * values[free + i] * values[free + j])
-            step[i, j] = pull[i] * pull[j]
-    information = invert_held(larger_of(covariance, step, 1.0), vectors, free, 1.0 / free_sigma**2)
+            M[i, j] *= freedom / (slope * slope * values[free + i] * values[free + j])
+    information = invert_held(at_least_along(M, pull), vectors, free, 1.0 / free_sigma**2)
     return to_origin(d, information, centre, radius), free_at_origin(d, vectors, free, centre, radius)
 
 
@@ -69,22 +66,43 @@ def linearise_pairs(
     normals: FloatArray, s: IntArray, t: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Jacobian (m, p) of the distances to the lines or planes, these (m,), and the gaps (m, 3) from their anchors."""
-    count = len(s)
-    jacobian, offset, gaps = np.zeros((count, 3 * (d - 1))), np.zeros(count), np.zeros((count, 3))
-    arm, n = np.zeros(3), np.zeros(3)
+    count, inverse = len(s), 1.0 / radius
+    jacobian, offset, gaps = np.empty((count, 3 * (d - 1))), np.empty(count), np.empty((count, 3))
     for k in range(count):
-        for a in range(d):
-            moved = T[a, 3]
-            for b in range(d):
-                moved += T[a, b] * source[s[k], b]
-            gaps[k, a] = moved - anchors[t[k], a]
-            offset[k] += gaps[k, a] * normals[t[k], a]
-            arm[a] = (source[s[k], a] - centre[a]) / radius
-            n[a] = 0.0
-            for b in range(d):
-                n[a] += T[b, a] * normals[t[k], b]
-        tangent_row(d, arm, n, jacobian[k])
+        at, to = s[k], t[k]
+        px, py, pz = source[at, 0], source[at, 1], source[at, 2]
+        n0, n1, n2, height = normals[to, 0], normals[to, 1], normals[to, 2], anchors[to, 2] if d == 3 else 0.0
+        gx = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3] - anchors[to, 0]
+        gy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3] - anchors[to, 1]
+        gz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3] - height
+        u = T[0, 0] * n0 + T[1, 0] * n1 + T[2, 0] * n2
+        v = T[0, 1] * n0 + T[1, 1] * n1 + T[2, 1] * n2
+        w = T[0, 2] * n0 + T[1, 2] * n1 + T[2, 2] * n2
+        x, y, z = (px - centre[0]) * inverse, (py - centre[1]) * inverse, (pz - centre[2]) * inverse
+        if d == 2:
+            jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = u, v, x * v - y * u
+        else:
+            jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = y * w - z * v, z * u - x * w, x * v - y * u
+            jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = u, v, w
+        gaps[k, 0], gaps[k, 1], gaps[k, 2], offset[k] = gx, gy, gz, gx * n0 + gy * n1 + gz * n2
     return jacobian, offset, gaps
+
+
+@kernel
+def weigh_rows(
+    jacobian: FloatArray, offset: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Hessian J^T W J (p, p), gradient J^T W r (p,) and scores W J (m, p)."""
+    count, p = jacobian.shape
+    gradient, scores = np.zeros(p), np.empty((count, p))
+    for a in range(0, p, 3):
+        x, y, z = 0.0, 0.0, 0.0
+        for k in range(count):
+            u, v, w = weight[k] * jacobian[k, a], weight[k] * jacobian[k, a + 1], weight[k] * jacobian[k, a + 2]
+            x, y, z = x + u * offset[k], y + v * offset[k], z + w * offset[k]
+            scores[k, a], scores[k, a + 1], scores[k, a + 2] = u, v, w
+        gradient[a], gradient[a + 1], gradient[a + 2] = x, y, z
+    return weighted_squares(jacobian, weight), gradient, scores
 
 
 @kernel
@@ -96,17 +114,21 @@ def rmse_of_pairs(
     total, squares = 0.0, 0.0
     metric, shift, moved = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for k in range(len(s)):
-        square, across, weight = 0.0, 0.0, 1.0
-        for a in range(d):
-            moved[a] = T[a, 3]
-            for b in range(d):
-                moved[a] += T[a, b] * source[s[k], b]
-            square += (moved[a] - target[t[k], a]) ** 2
-            across += (moved[a] - anchors[t[k], a]) * normals[t[k], a]
-        if residual == PLANE:
-            square, weight = across * across, trust[t[k]]
-        elif residual == GENERALISED:
-            square = metric_of_pair(d, T, target[t[k]], moved, normals[t[k]], source_normals[s[k]], plane_share, metric,
+        at, to, weight = s[k], t[k], 1.0
+        px, py, pz = source[at, 0], source[at, 1], source[at, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if residual == POINT:
+            square = (x - target[to, 0]) ** 2 + (y - target[to, 1]) ** 2 + (z - target[to, 2]) ** 2
+        elif residual == PLANE:
+            across = (x - anchors[to, 0]) * normals[to, 0] + (y - anchors[to, 1]) * normals[to, 1]
+            if d == 3:
+                across += (z - anchors[to, 2]) * normals[to, 2]
+            square, weight = across * across, trust[to]
+        else:
+            moved[0], moved[1], moved[2] = x, y, z
+            square = metric_of_pair(d, T, target[to], moved, normals[to], source_normals[at], plane_share, metric,
                                     shift) ** 2  # fmt: skip
         total += weight
         squares += weight * square
@@ -128,8 +150,7 @@ def weigh_pairs(
         return weight, 1.0
     scale = scale_given
     if scale <= 0 or residual != PLANE:
-        middle = count // 2
-        scale = max(np.partition(length, middle)[middle] / MEDIAN_1, floor)
+        scale = max(middle_of(length, count) / MEDIAN_1, floor)
     bent, total = 0.0, 0.0
     for k in range(count):
         bent += weight[k] * robust_slope(loss, length[k] / scale)
@@ -139,39 +160,13 @@ def weigh_pairs(
 
 
 @kernel
-def weighted_square(jacobian: FloatArray, weight: FloatArray) -> FloatArray:
-    """Matrix J^T W J (p, p)."""
-    count, p = jacobian.shape
-    H = np.zeros((p, p))
-    for k in range(count):
-        for a in range(p):
-            along = weight[k] * jacobian[k, a]
-            for b in range(a + 1):
-                H[a, b] += along * jacobian[k, b]
-    for a in range(p):
-        for b in range(a):
-            H[b, a] = H[a, b]
-    return H
-
-
-@kernel
-def scores_along(jacobian: FloatArray, weight: FloatArray, vectors: FloatArray, free: int) -> FloatArray:
-    """Weight times Jacobian (m, p) along the eigenvectors (p, p) after the first `free`: (m, p - free)."""
-    count, p = jacobian.shape
-    scores = np.zeros((count, p - free))
-    for k in range(count):
-        for j in range(p - free):
-            along = 0.0
-            for a in range(p):
-                along += jacobian[k, a] * vectors[a, free + j]
-            scores[k, j] = weight[k] * along
-    return scores
-
-
-@kernel
 def invert_held(covariance: FloatArray, vectors: FloatArray, free: int, lowest: float) -> FloatArray:
     """Information (p, p) from the covariance (h, h) along the held eigenvectors; `lowest` along the free ones."""
     p, held = len(vectors), len(covariance)
+    if free == 0 and np.trace(covariance) * lowest <= 1.0:  # the rule: no direction is near the limit
+        inverse, exists = inverse_of_positive(covariance)
+        if exists:
+            return congruent(inverse, vectors.T, 0)
     information, axis = np.zeros((p, p)), np.zeros(p)
     for j in range(free):
         for a in range(p):
