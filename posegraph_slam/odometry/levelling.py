@@ -31,6 +31,8 @@ class LevellingSettings(Settings):
     """further than this above it, ceiling."""
     ground_reach_m: float = Field(default=1.2, ge=0)
     """The ground that the robot drove on is known this far beside its path; 0: it is not looked at."""
+    ground_way_m: float = Field(default=20.0, gt=0)
+    """of what was driven this much before or after a scan, until the poses are optimised: odometry drifts;"""
     ground_height_m: float = Field(default=0.12, gt=0)
     """Returns no higher above that ground are ground: the ramp before a robot that still stands level, for example."""
     self_returns: SelfReturnSettings = SelfReturnSettings()
@@ -50,19 +52,21 @@ def level_laser(
 ) -> LevelledScans:
     """Level scans (N, B) with roll and pitch, and drop the robot itself, ground and ceiling.
 
-    `path` (N, 4, 4) are better base poses than the odometry's; from them, too, comes the ground that was driven. The
-    result keeps the scanner's beams; its frame is gravity's, at the scanner, with x above the scanner's own x axis.
+    The ground that was driven comes from odometry shortly before and after each scan, or from all of `path` (N, 4, 4),
+    the optimised poses of the base. The result keeps the scanner's beams; its frame is gravity's, at the scanner, with
+    x above the scanner's own x axis.
     """
     own = find_self_returns(scans.ranges_m, odometry.travel_m, settings.self_returns)
     poses = (odometry.trajectory if path is None else path).poses
     ranges = scans.ranges_m.copy()
-    ground = _DrivenGround(poses, odometry, settings)
+    way_m = settings.ground_way_m if path is None else np.inf
+    ground = _DrivenGround(poses, odometry, settings, way_m)
     counts = np.zeros(2, dtype=np.int64)
     for start, stop in split_range(len(scans), SCANS_A_CHUNK):
         part = slice(start, stop)
         chunk = ranges[part]
         robot = own.mask(chunk)
-        on_ground = ground.hit(chunk, scans, poses[part] @ scans.T_base_lidar)
+        on_ground = ground.hit(chunk, scans, part)
         counts += [robot.sum(), (on_ground & ~robot).sum()]
         chunk[robot | on_ground] = 0.0
     R = odometry.level_rotations
@@ -86,27 +90,30 @@ def level_laser(
 class _DrivenGround:
     """The ground under the path as a plane at every 0.1 m of it, known a little to either side."""
 
-    def __init__(self, poses: FloatArray, odometry: SpatialOdometry, settings: LevellingSettings) -> None:
+    def __init__(self, poses: FloatArray, odometry: SpatialOdometry, settings: LevellingSettings, way_m: float) -> None:
         step = np.floor((odometry.travel_m - odometry.travel_m[0]) / GROUND_SPACING_M)
-        chosen = poses[np.concatenate([[True], np.diff(step) > 0])]
-        self.settings = settings
-        self.places, self.up = chosen[:, :3, 3], chosen[:, :3, 2]
-        self.tree = cKDTree(self.places[:, :2])
+        chosen = np.concatenate([[True], np.diff(step) > 0])
+        self.settings, self.poses, self.way_m = settings, poses, way_m
+        self.ground, self.travel, self.ground_travel = poses[chosen], odometry.travel_m, odometry.travel_m[chosen]
 
-    def hit(self, ranges: Float32Array, scans: LaserScans, T: FloatArray) -> BoolArray:
-        """Which ranges (n, B) of scanners at T (n, 4, 4) end on the ground beside the path."""
+    def hit(self, ranges: Float32Array, scans: LaserScans, part: slice) -> BoolArray:
+        """Which ranges (n, B) of the scans in `part` end on the ground beside the path."""
         result = np.zeros(ranges.shape, dtype=np.bool_)
-        reach = self.settings.ground_reach_m
-        if reach <= 0:
+        reach, travel = self.settings.ground_reach_m, self.travel[part]
+        first = np.searchsorted(self.ground_travel, travel[0] - self.way_m)
+        last = np.searchsorted(self.ground_travel, travel[-1] + self.way_m, side="right")
+        near = self.ground[first:last]
+        if reach <= 0 or len(near) == 0:
             return result
+        T = self.poses[part] @ scans.T_base_lidar
         rows, beams = np.nonzero((ranges >= scans.range_min_m) & (ranges < scans.range_max_m))
         r, angle = ranges[rows, beams].astype(np.float64), scans.angles_rad[beams]
         points = np.einsum("nij,nj->ni", T[rows, :3, :2], np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1))
         points += T[rows, :3, 3]
-        distance, nearest = self.tree.query(points[:, :2], distance_upper_bound=reach)
+        distance, nearest = cKDTree(near[:, :2, 3]).query(points[:, :2], distance_upper_bound=reach)
         beside = np.flatnonzero(np.isfinite(distance))
-        at = np.asarray(nearest)[beside]
-        above = np.sum((points[beside] - self.places[at]) * self.up[at], axis=1)
+        at = near[np.asarray(nearest)[beside]]
+        above = np.sum((points[beside] - at[:, :3, 3]) * at[:, :3, 2], axis=1)
         low = above < self.settings.ground_height_m
         result[rows[beside[low]], beams[beside[low]]] = True
         return result

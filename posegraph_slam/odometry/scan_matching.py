@@ -15,6 +15,7 @@ from posegraph_slam.odometry.estimate import OdometryEstimate, covariance_betwee
 from posegraph_slam.odometry.hit_map_tracking import track_on_hits
 from posegraph_slam.odometry.local_map import STATISTICS, track
 from posegraph_slam.odometry.scan_to_scan import chain_by_icp
+from posegraph_slam.odometry.wheel_calibration import UNCALIBRATED, WayByScans, WheelCalibration
 from posegraph_slam.registration.beam_information import information_in_base, information_with_floor, inverse
 from posegraph_slam.registration.beam_matching import BeamMatchSettings
 from posegraph_slam.registration.beam_scans import BeamScans
@@ -74,7 +75,8 @@ class ScanMatchingResult:
     `keyframe_information` (K-1, 3, 3) belongs to the motion from keyframe k to k+1, `scan_information` (N, 3, 3) to
     the pose of each scan in the local map; both in the tangent of the right update in the base frame.
     `matched_fraction` (N,) is the share of a scan's points that found a surface; `searched` holds the scans for which
-    a window was searched. `lag` of the odometry and duration of a `sweep`, both in scan intervals, were corrected.
+    a window was searched. `lag` of the odometry and duration of a `sweep`, both in scan intervals, were corrected, and
+    so was the way of the `wheels` where they were calibrated.
     """
 
     trajectory: Trajectory
@@ -85,6 +87,7 @@ class ScanMatchingResult:
     searched: IntArray
     lag: float = 0.0
     sweep: float = 0.0
+    wheels: WheelCalibration = UNCALIBRATED
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -93,6 +96,11 @@ class ScanMatchingResult:
         object.__setattr__(self, "scan_information", read_only(self.scan_information))
         object.__setattr__(self, "matched_fraction", read_only(self.matched_fraction))
         object.__setattr__(self, "searched", read_only(self.searched, np.int64))
+
+    @property
+    def way(self) -> WayByScans:
+        """What the scans say of the way, to compare wheels with."""
+        return WayByScans(poses=self.trajectory.poses, information=self.scan_information, keyframes=self.keyframes)
 
 
 def match_scans(

@@ -43,7 +43,7 @@ class SpatialOdometry:
 
     `trajectory` T_odom_base (N, 4, 4), in the order of the scans; `travel_m` (N,) the way driven; `tilt_sigma_rad` (N,)
     of roll and pitch. `planar` is the plan view of the level lidar frame: origin at the scanner, x above its heading,
-    z up; its covariance is that of the steps in that frame.
+    z up; its covariance is that of the steps in that frame. `tilt` is that at every IMU sample.
     """
 
     trajectory: Trajectory
@@ -51,6 +51,7 @@ class SpatialOdometry:
     tilt_sigma_rad: FloatArray
     planar: OdometryEstimate
     T_base_lidar: FloatArray
+    tilt: Tilt
 
     def __post_init__(self) -> None:
         for name in ("travel_m", "tilt_sigma_rad", "T_base_lidar"):
@@ -85,12 +86,12 @@ class SpatialOdometry:
 
 
 def spatial_odometry_at_scans(
-    log: RobotLog, settings: OdometrySettings, spatial: SpatialOdometrySettings
+    log: RobotLog, settings: OdometrySettings, spatial: SpatialOdometrySettings, *, tilt: Tilt | None = None
 ) -> SpatialOdometry:
     """Give every laser scan a pose in space from wheel encoders and IMU.
 
     The wheels' way runs along the body's x axis, which the tilt lays up and down the slopes; the heading comes from
-    the gyro. Raises InputError for a log without scans, encoders or IMU.
+    the gyro. `tilt` is taken where it is known already. Raises InputError for a log without scans, encoders or IMU.
     """
     if log.scans is None or len(log.scans) == 0:
         raise InputError(log.path, "the log has no laser scans", "record a LiDAR, or give a log that has one")
@@ -99,7 +100,7 @@ def spatial_odometry_at_scans(
     if log.encoders is None:
         raise InputError(log.path, "has no wheel encoders, which poses in space need", 'set pose_graph.group = "se2"')
     encoders, scans = log.encoders, log.scans
-    tilt = estimate_tilt(encoders, log.imu, spatial.tilt)
+    tilt = tilt or estimate_tilt(encoders, log.imu, spatial.tilt)
     driven = wheel_imu_odometry(encoders, log.imu, settings, tilt=tilt)
     base = resample_at_scans(driven, scans.stamps_s, settings)
     distance = np.concatenate([[0.0], encoders.travel_m[1:].mean(axis=1)])
@@ -120,6 +121,7 @@ def spatial_odometry_at_scans(
         tilt_sigma_rad=tilt.sigma_at(scans.stamps_s),
         planar=_level_lidar(base, trajectory, scans, tilt),
         T_base_lidar=scans.T_base_lidar,
+        tilt=tilt,
     )
 
 

@@ -22,14 +22,16 @@ def match_log(
     *,
     executor: Executor,
     progress: Progress,
+    known: ScanMatchingResult | None = None,
 ) -> ScanMatchingResult:
     """Chain all scans (N) from their odometry (N), after both clocks were compared; see `TimingSettings`.
 
-    Where there is no odometry, the motion during a sweep is that of a first matching without regard to it.
+    An earlier matching that is `known` has told the clocks. Where there is no odometry, the motion during a sweep is
+    that of a first matching without regard to it.
     """
     matching, settings = configuration.scan_matching, configuration.timing
-    lag = sweep = 0.0
-    if settings.estimate and matching.matcher != "none":
+    lag, sweep = (0.0, 0.0) if known is None else (known.lag, known.sweep)
+    if known is None and settings.estimate and matching.matcher != "none":
         stretch = turning_stretch(odometry, settings)
         beams = prepare_beam_scans(scans.select(stretch), configuration.scans, executor)
         timing = estimate_timing(beams, odometry.part(stretch), matching, settings)

@@ -10,9 +10,11 @@ from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import Trajectory
 from posegraph_slam.mapping.archive import npz_bytes, read_npz, replace_file
 from posegraph_slam.odometry.scan_matching import ScanMatchingResult
+from posegraph_slam.odometry.wheel_calibration import WheelCalibration
 
 MATCHING = "scan_matching.npz"
 CLOCKS = ("lag", "sweep")
+WHEELS = ("scale", "sigma", "noise_per_sqrt_m")
 ARRAYS = ("keyframes", "keyframe_information", "scan_information", "matched_fraction", "searched")
 
 
@@ -21,12 +23,13 @@ def write_matching(matched: ScanMatchingResult, path: Path) -> None:
     arrays = {name: getattr(matched, name) for name in ARRAYS}
     trajectory = {"stamps_s": matched.trajectory.stamps_s, "poses": matched.trajectory.poses}
     clocks = {name: np.array(getattr(matched, name)) for name in CLOCKS}
-    replace_file(path, npz_bytes({**trajectory, **clocks, **arrays}))
+    wheels = {"wheels": np.array([getattr(matched.wheels, name) for name in WHEELS])}
+    replace_file(path, npz_bytes({**trajectory, **clocks, **wheels, **arrays}))
 
 
 def read_matching(path: Path, scans: int) -> ScanMatchingResult:
     """Read the scan matching of a log of `scans` scans; InputError where the file is of another log."""
-    arrays = read_npz(path, ("stamps_s", "poses", *CLOCKS, *ARRAYS))
+    arrays = read_npz(path, ("stamps_s", "poses", "wheels", *CLOCKS, *ARRAYS))
     count = len(arrays["stamps_s"])
     if count != scans:
         raise InputError(path, f"holds {count} scans, but the log has {scans}", "give the run directory of this log")
@@ -42,4 +45,5 @@ def read_matching(path: Path, scans: int) -> ScanMatchingResult:
         searched=arrays["searched"],
         lag=float(arrays["lag"]),
         sweep=float(arrays["sweep"]),
+        wheels=WheelCalibration(**dict(zip(WHEELS, arrays["wheels"].tolist(), strict=True))),
     )

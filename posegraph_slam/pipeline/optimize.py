@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -135,9 +135,18 @@ def match(
     clock, scans = clock or StageClock(), usable_scans(log)
     with clock.stage("odometry"):
         view = PlanView.of(log, scans, configuration)
+        if matched is not None:
+            view = view.calibrated(log, matched.wheels)
     with clock.stage("scan matching"):
         if matched is None:
             matched = match_log(view.scans, view.odometry, view.configuration, executor=executor, progress=progress)
+            wheels = view.calibration(matched)
+            if wheels.known:
+                view = view.calibrated(log, wheels)
+                matched = match_log(
+                    view.scans, view.odometry, view.configuration, executor=executor, progress=progress, known=matched
+                )
+                matched = replace(matched, wheels=wheels)
         beams = keyframe_scans(view.scans, matched, view.configuration, executor)
     return MatchedLog(view=view, matched=matched, beams=beams)
 

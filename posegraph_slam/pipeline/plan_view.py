@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from posegraph_slam.arrays import IntArray
 from posegraph_slam.execution import Progress
@@ -15,6 +15,7 @@ from posegraph_slam.odometry.scan_odometry import odometry_at_scans
 from posegraph_slam.odometry.smoothing import smooth
 from posegraph_slam.odometry.spatial import SpatialOdometry, spatial_odometry_at_scans
 from posegraph_slam.odometry.timing import without_lag
+from posegraph_slam.odometry.wheel_calibration import UNCALIBRATED, WheelCalibration, calibrate_wheels
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.spatial import Heights, lift_graph
 from posegraph_slam.pose_graph.graph import PoseGraph
@@ -49,19 +50,34 @@ class PlanView:
             odometry = odometry_at_scans(log, configuration.odometry)
             return PlanView(scans=scans, odometry=odometry, configuration=configuration, raw=scans)
         spatial = spatial_odometry_at_scans(log, configuration.odometry, configuration.spatial.odometry)
-        level = level_laser(scans, spatial, configuration.spatial.levelling)
-        matching = configuration.scan_matching
         if not configuration.spatial.search:
-            trusting = matching.model_copy(update={"matched_fraction_min": 0.0})
-            configuration = configuration.model_copy(update={"scan_matching": trusting})
-        return PlanView(
-            scans=level.scans,
-            odometry=spatial.planar,
-            configuration=configuration,
-            raw=scans,
-            spatial=spatial,
-            remarks=level.remarks,
+            configuration = _trusting(configuration, matched_fraction_min=0.0)
+        return _in_space(scans, spatial, configuration)
+
+    def calibration(self, matched: ScanMatchingResult) -> WheelCalibration:
+        """Calibrate the wheels against matched scans, where poses in space need it, and wheels are trusted at all."""
+        configuration = self.configuration
+        wheels, matching = configuration.spatial.wheels, configuration.scan_matching
+        wanted = wheels.enabled and matching.matcher == "local_map" and not configuration.spatial.search
+        if self.spatial is None or not wanted:
+            return UNCALIBRATED
+        odometry = without_lag(self.odometry, matched.lag)
+        return calibrate_wheels(matched.way, odometry, matching.prediction_sigma_m, wheels)
+
+    def calibrated(self, log: RobotLog, wheels: WheelCalibration) -> PlanView:
+        """Return the view with the way of calibrated wheels; itself where they are not."""
+        if self.spatial is None or not wheels.known or log.encoders is None:
+            return self
+        configuration = self.configuration
+        spatial = spatial_odometry_at_scans(
+            replace(log, encoders=wheels.applied(log.encoders)),
+            wheels.noise(configuration.odometry),
+            configuration.spatial.odometry,
+            tilt=self.spatial.tilt,
         )
+        sigma_m = min(configuration.scan_matching.prediction_sigma_m, configuration.spatial.wheels.prediction_sigma_m)
+        view = _in_space(self.raw, spatial, _trusting(configuration, prediction_sigma_m=sigma_m))
+        return replace(view, remarks=(wheels.remark, *view.remarks))
 
     def apart(self, keyframes: IntArray) -> Apart | None:
         """Tell keyframes (K,) on different levels apart, where heights are known."""
@@ -99,3 +115,21 @@ class PlanView:
         if not self.configuration.smoothing or self.odometry.source not in WHEELS:
             return planar
         return smooth(planar, matched.scan_information, without_lag(self.odometry, matched.lag))
+
+
+def _in_space(scans: LaserScans, spatial: SpatialOdometry, configuration: Configuration) -> PlanView:
+    level = level_laser(scans, spatial, configuration.spatial.levelling)
+    return PlanView(
+        scans=level.scans,
+        odometry=spatial.planar,
+        configuration=configuration,
+        raw=scans,
+        spatial=spatial,
+        remarks=level.remarks,
+    )
+
+
+def _trusting(configuration: Configuration, **matching: float) -> Configuration:
+    """Return the configuration with settings of scan matching that rely on wheels and gyro more."""
+    changed = configuration.scan_matching.model_copy(update=matching)
+    return configuration.model_copy(update={"scan_matching": changed})

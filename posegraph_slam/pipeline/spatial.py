@@ -12,6 +12,7 @@ from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.geometry import SE3, Trajectory, inverse_pose
 from posegraph_slam.odometry.levelling import LevellingSettings
 from posegraph_slam.odometry.spatial import SpatialOdometry, SpatialOdometrySettings
+from posegraph_slam.odometry.wheel_calibration import WheelCalibrationSettings
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
 from posegraph_slam.settings import Settings
 
@@ -28,6 +29,7 @@ class SpatialSettings(Settings):
 
     odometry: SpatialOdometrySettings = SpatialOdometrySettings()
     levelling: LevellingSettings = LevellingSettings()
+    wheels: WheelCalibrationSettings = WheelCalibrationSettings()
     search: bool = False
     """Whether scan matching searches a window where few points match. On a ramp little but the side walls is left,
     along which a scan slides, and wheels and gyro know each step better; wheels that slip for metres need it."""
