@@ -29,7 +29,7 @@ class LevellingSettings(Settings):
     """Returns further than this below the scanner, once levelled, are ground;"""
     box_above_m: float = Field(default=1.2, gt=0)
     """further than this above it, ceiling."""
-    ground_reach_m: float = Field(default=1.2, ge=0)
+    ground_reach_m: float = Field(default=1.8, ge=0)
     """The ground that the robot drove on is known this far beside its path; 0: it is not looked at."""
     ground_way_m: float = Field(default=20.0, gt=0)
     """of what was driven this much before or after a scan, until the poses are optimised: odometry drifts;"""
@@ -110,6 +110,8 @@ class _DrivenGround:
         r, angle = ranges[rows, beams].astype(np.float64), scans.angles_rad[beams]
         points = np.einsum("nij,nj->ni", T[rows, :3, :2], np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1))
         points += T[rows, :3, 3]
+        low = np.flatnonzero(points[:, 2] < self._level_of_ground(near))
+        rows, beams, points = rows[low], beams[low], points[low]
         distance, nearest = cKDTree(near[:, :2, 3]).query(points[:, :2], distance_upper_bound=reach)
         beside = np.flatnonzero(np.isfinite(distance))
         at = near[np.asarray(nearest)[beside]]
@@ -117,3 +119,9 @@ class _DrivenGround:
         low = above < self.settings.ground_height_m
         result[rows[beside[low]], beams[beside[low]]] = True
         return result
+
+    def _level_of_ground(self, near: FloatArray) -> float:
+        """Height above which nothing is on the planes of `near` (K, 4, 4): most points need no search for a plane."""
+        up = near[:, :3, 2]
+        aside = self.settings.ground_reach_m * float(np.hypot(up[:, 0], up[:, 1]).max())
+        return float(near[:, 2, 3].max() + (self.settings.ground_height_m + aside) / up[:, 2].min())

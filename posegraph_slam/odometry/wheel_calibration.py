@@ -16,8 +16,6 @@ from posegraph_slam.settings import Settings
 
 TURN_MAX_RAD = 1.0
 """Steps between keyframes that turn further say nothing of the way."""
-NOISE_MIN = 0.002
-"""m of sigma after 1 m: no wheels are evener than this on a floor."""
 
 
 class WheelCalibrationSettings(Settings):
@@ -31,6 +29,9 @@ class WheelCalibrationSettings(Settings):
     """A larger share is no matter of tyres: it is not believed."""
     window_m: float = Field(default=2.0, gt=0)
     """Wheels and scans are compared over stretches of this length."""
+    noise_min_per_sqrt_m: float = Field(default=0.015, gt=0)
+    """m of position sigma after driving 1 m with calibrated wheels: as found, but no less, since the scans show the way
+    on level ground above all, and wheels slip on slopes."""
     prediction_sigma_m: float = Field(default=0.002, gt=0)
     """`scan_matching.prediction_sigma_m` of calibrated wheels, whose systematic error is taken off."""
 
@@ -60,10 +61,10 @@ class WheelCalibration:
         """Return the encoders with their metres a tick corrected."""
         return replace(encoders, metres_per_tick=encoders.metres_per_tick * self.scale)
 
-    def noise(self, settings: OdometrySettings) -> OdometrySettings:
-        """Return the settings with the noise of the way that was found, where it is less than theirs."""
+    def noise(self, settings: OdometrySettings, least: float) -> OdometrySettings:
+        """Return the settings with the noise of the way that was found, or `least`, where it is less than theirs."""
         noise = settings.wheels_imu_noise
-        less = min(noise.translation_per_sqrt_m, max(self.noise_per_sqrt_m, NOISE_MIN))
+        less = min(noise.translation_per_sqrt_m, max(self.noise_per_sqrt_m, least))
         return settings.model_copy(
             update={"wheels_imu_noise": noise.model_copy(update={"translation_per_sqrt_m": less})}
         )

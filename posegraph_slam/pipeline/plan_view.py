@@ -71,7 +71,7 @@ class PlanView:
         configuration = self.configuration
         spatial = spatial_odometry_at_scans(
             replace(log, encoders=wheels.applied(log.encoders)),
-            wheels.noise(configuration.odometry),
+            wheels.noise(configuration.odometry, configuration.spatial.wheels.noise_min_per_sqrt_m),
             configuration.spatial.odometry,
             tilt=self.spatial.tilt,
         )

@@ -109,6 +109,21 @@ def test_ground_and_ceiling_are_dropped_on_ramps_and_walls_elsewhere_kept(log, o
     assert kept[1] > 0.97 * raw[1]
 
 
+def test_ground_is_known_from_nearby_way_while_odometry_drifts(log, odometry):
+    """A drift in height by which later laps pass over the earlier ones must not hide walls, nor show the ramps."""
+    travel = odometry.travel_m
+    drifted = odometry.trajectory.poses.copy()
+    drifted[:, 2, 3] += np.linspace(0.0, 1.2, len(travel))
+    bent = dataclasses.replace(odometry, trajectory=odometry.trajectory.with_poses(drifted))
+    settings = LevellingSettings(ground_way_m=6.0, self_returns={"enabled": False})
+    right = level_laser(log.scans, odometry, settings).scans.returns()
+    near = level_laser(log.scans, bent, settings).scans.returns()
+    everywhere = level_laser(log.scans, bent, settings.model_copy(update={"ground_way_m": 1e6})).scans.returns()
+    assert np.mean(near != right) < 0.5 * np.mean(everywhere != right)
+    optimised = level_laser(log.scans, bent, settings, path=odometry.trajectory).scans.returns()
+    assert np.mean(optimised != right) < 0.02
+
+
 def test_levelling_a_level_scan_changes_nothing(odometry, log):
     still = Trajectory(
         stamps_s=log.scans.stamps_s, poses=np.tile(np.eye(4), (len(log.scans), 1, 1)), parent="odom", child="base"
