@@ -23,8 +23,7 @@ from posegraph_slam.registration.uncertainty import CAUCHY, describe_pairs, rmse
 CONVERGED, MAX_ITERATIONS, TOO_FEW_INLIERS, DEGENERATE = 0, 1, 2, 3
 
 ROUNDS_IN_PLANE, ROUNDS_IN_SPACE = 1, 3
-"""Rounds from the end of point-to-point to the pose it is held against. In the plane more change its mean NEES by
-0.03; in space, where it ends 5 cm away, one leaves it at 8 instead of 6."""
+"""Rounds from the end of point-to-point to the pose it is held against: more change its mean NEES by 0.03."""
 
 
 @kernel
