@@ -74,16 +74,16 @@ def gap_between(d: int, T: FloatArray, other: FloatArray, centre: FloatArray, ra
     x, y, z = (turn[2, 1] - turn[1, 2]) / 2, (turn[0, 2] - turn[2, 0]) / 2, (turn[1, 0] - turn[0, 1]) / 2
     sine = np.sqrt(x * x + y * y + z * z)
     angle = np.arcsin(min(sine, 1.0))
-    grown, c = 1.0, 1.0 / 12.0
+    grown, bend = 1.0, 1.0 / 12.0
     if angle > 1e-4:
         grown = angle / sine
-        c = (1.0 - angle * (1.0 + np.cos(angle)) / (2.0 * sine)) / (angle * angle)
+        bend = (1.0 - angle * (1.0 + np.cos(angle)) / (2.0 * sine)) / (angle * angle)
     x, y, z = grown * x, grown * y, grown * z
-    # V^-1 = 1 - K / 2 + c K K for K = hat(turn) (Sola et al. 2018, equation 146)
+    # V^-1 = 1 - K / 2 + bend K K for K = hat(turn) (Sola et al. 2018, equation 146)
     u, v, w = y * shift[2] - z * shift[1], z * shift[0] - x * shift[2], x * shift[1] - y * shift[0]
-    apart[0] = shift[0] - u / 2 + c * (y * w - z * v)
-    apart[1] = shift[1] - v / 2 + c * (z * u - x * w)
-    apart[2] = shift[2] - w / 2 + c * (x * v - y * u)
+    apart[0] = shift[0] - u / 2 + bend * (y * w - z * v)
+    apart[1] = shift[1] - v / 2 + bend * (z * u - x * w)
+    apart[2] = shift[2] - w / 2 + bend * (x * v - y * u)
     if d == 2:
         gap[0], gap[1], gap[2] = apart[0], apart[1], radius * z
         return gap
