@@ -133,13 +133,14 @@ def test_accuracy_on_real_runs(psg_data: Path, tmp_path: Path, number: int) -> N
     difference = estimate - expected
     difference[:, 0] -= difference[0, 0]
     difference = (difference + np.pi) % (2 * np.pi) - np.pi
-    yaw, pitch, _ = rms_deg(difference)
+    yaw, pitch, roll = rms_deg(difference)
+    assert roll < 3.0
     assert pitch < 1.8
     assert yaw < 4.0
     # Roll and yaw have a pole at 90 degrees of pitch, which runs 1 and 2 visit to within 0.3 degrees.
     away = np.abs(np.degrees(expected[:, 1])) < 80
     yaw_away, _, roll_away = rms_deg(difference[away])
-    assert roll_away < 0.9
+    assert roll_away < 1.1
     assert yaw_away < 3.2
 
 
@@ -149,10 +150,47 @@ def test_real_runs_on_one_clock_are_accurate_at_the_pole_too(psg_data: Path, tmp
     source = psg_data / "orientation" / f"imu_vicon_{number}.npz"
     record = json.loads(psg("attitude", source, "--out", tmp_path / "a.tum", "--json").stdout)
     errors = record["errors_on_imu_clock"]
-    assert record["truth_late_s"] == pytest.approx([0.026, 0.026, 0.006][number - 1], abs=0.002)
+    # What remains of 26, 26 and 6 ms when the reader takes the mean of 19.5 ms off.
+    assert record["truth_late_s"] == pytest.approx([0.0065, 0.0065, -0.0132][number - 1], abs=0.002)
     assert errors["roll_deg"] < 2.0
     assert errors["pitch_deg"] < 2.0
     assert errors["yaw_deg"] < 4.0
+
+
+def disturbed(counts: np.ndarray, kind: str) -> np.ndarray:
+    """Return the counts (6, N) of a run as another board, another amplifier or a noisier one would have them."""
+    rng = np.random.default_rng(7)
+    if kind == "noise":
+        return counts + rng.normal(0, 1.5, counts.shape)
+    if kind == "gyro zeros":
+        return counts + np.array([0, 0, 0, 9, -7, 6])[:, None]
+    if kind == "accelerometer zeros":
+        return counts + np.array([-8, 8, -8, 0, 0, 0])[:, None]
+    zero = counts[:, :200].mean(axis=1)
+    zero[:3] = 511.5
+    return zero[:, None] + 1.03 * (counts - zero[:, None])
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("kind", ["start", "noise", "gyro zeros", "accelerometer zeros", "gains"])
+def test_disturbed_real_runs_stay_accurate(psg_data: Path, tmp_path: Path, kind: str) -> None:
+    """Roll and pitch within 3 deg, yaw within 8 deg, where a run starts in motion or comes from a changed board."""
+    for number in (1, 2, 3):
+        with np.load(psg_data / "orientation" / f"imu_vicon_{number}.npz") as archive:
+            fields = dict(archive)
+        counts, stamps = fields["imu_raw"].astype(float), fields["imu_stamps_s"]
+        if kind == "start":
+            kept = stamps > stamps[0] + 9.0
+            fields |= {"imu_raw": counts[:, kept], "imu_stamps_s": stamps[kept]}
+        else:
+            fields["imu_raw"] = np.clip(np.rint(disturbed(counts, kind)), 0, 1023)
+        path = tmp_path / f"run{number}.npz"
+        np.savez(path, **fields)
+        record = json.loads(psg("attitude", path, "--out", tmp_path / f"{number}.tum", "--json").stdout)
+        errors = record["errors"]["ukf"]
+        assert errors["roll_deg"] < 3.0, number
+        assert errors["pitch_deg"] < 3.0, number
+        assert errors["yaw_deg"] < 8.0, number
 
 
 @pytest.mark.data

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -224,6 +226,18 @@ def test_agrees_with_an_extended_filter(seed: int) -> None:
     assert np.degrees(apart).max() < 0.1
     R = actual[-1]
     np.testing.assert_allclose(R.T @ stream.covariance[-1, :3, :3] @ R, P[:3, :3], rtol=0.1, atol=2e-6)
+
+
+def test_uncertain_gains_are_found_from_gravity() -> None:
+    imu, truth, _ = tumble(8)
+    true = np.array([1.05, 0.94, 1.0])
+    wrong = replace(imu, angular_velocity=imu.angular_velocity / true)
+    found = estimate_attitude(replace(wrong, gyro_gain_sigma=0.1), NOISE)
+    left = estimate_attitude(wrong, NOISE)
+    assert "gravity shows the gyro's gains to be off" in found.remarks[-1]
+    assert len(left.remarks) == 1
+    angle_found, angle_left = (attitude_errors(each.trajectory, truth).angle_deg for each in (found, left))
+    assert angle_found < 0.5 * angle_left
 
 
 def test_mounting_turns_the_imu_into_the_base() -> None:

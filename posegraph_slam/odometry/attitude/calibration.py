@@ -9,10 +9,10 @@ from scipy.optimize import least_squares
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.odometry.attitude.complementary import complementary_stream
-from posegraph_slam.odometry.attitude.estimate import steps
 from posegraph_slam.odometry.attitude.quaternions import rotation_from_wxyz
 from posegraph_slam.odometry.attitude.settings import AttitudeSettings
 from posegraph_slam.odometry.attitude.start import find_start
+from posegraph_slam.odometry.attitude.steps import steps
 from posegraph_slam.sensors import STANDARD_GRAVITY, Imu
 
 BLOCK_S = 1.0

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import Trajectory, pose_from_rotation_translation
+from posegraph_slam.odometry.attitude.calibration import estimate_gyro_gain
 from posegraph_slam.odometry.attitude.complementary import complementary_stream
 from posegraph_slam.odometry.attitude.quaternions import rotation_from_wxyz, wxyz_from_rotation
 from posegraph_slam.odometry.attitude.settings import AttitudeMethod, AttitudeSettings
 from posegraph_slam.odometry.attitude.start import find_start
+from posegraph_slam.odometry.attitude.steps import steps
 from posegraph_slam.odometry.attitude.ukf import initial_state, run_ukf, smoothed
 from posegraph_slam.sensors import STANDARD_GRAVITY, Imu
+
+WORTH_SAYING = 0.01
+"""Corrections of the gains below this are within their errors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,11 +60,13 @@ def estimate_attitude(
     """Estimate the orientation of the base at every IMU stamp from gyro and accelerometer.
 
     Rates and accelerations are turned into the base by `T_base_imu`; the lever arm is neglected. Rates that are NaN are
-    unknown. `smoother` is the filter with a backward pass, by which later samples correct earlier ones. Raises
-    `InputError` for an IMU without samples, one whose clock runs backwards or without acceleration.
+    unknown. `smoother` is the filter with a backward pass, by which later samples correct earlier ones. Gains of the
+    gyro that are uncertain (`gyro_gain_sigma`) are first found from gravity, whatever the method. Raises `InputError`
+    for an IMU without samples, one whose clock runs backwards or without acceleration.
     """
     settings = settings or AttitudeSettings()
     _check(imu)
+    imu, remarks = _with_found_gains(imu)
     R_base_imu = imu.T_base_imu[:3, :3]
     omega, accel = imu.angular_velocity @ R_base_imu.T, imu.linear_acceleration @ R_base_imu.T
     start = find_start(imu.stamps_s, omega, accel, settings)
@@ -84,19 +91,20 @@ def estimate_attitude(
         covariance=covariance,
         gyro_bias=bias,
         corrected_share=share,
-        remarks=(start.remark,),
+        remarks=(start.remark, *remarks),
     )
 
 
-def steps(stamps_s: FloatArray, omega: FloatArray, max_gap_s: float) -> tuple[FloatArray, FloatArray]:
-    """Durations (N,) of the steps that end at each sample and the mean rates (N, 3) over them; the first has none.
-
-    The mean of the rates at both ends is exact to second order. Over a gap longer than `max_gap_s` the rate is NaN.
-    """
-    dt = np.diff(stamps_s, prepend=stamps_s[0])
-    rates = 0.5 * (omega + np.concatenate([omega[:1], omega[:-1]]))
-    rates[dt > max_gap_s] = np.nan
-    return dt, rates
+def _with_found_gains(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
+    """Correct the gains of a gyro whose own are uncertain, and say by how much where it is more than a per cent."""
+    if imu.gyro_gain_sigma == 0.0:
+        return imu, ()
+    gain, _ = estimate_gyro_gain([imu], prior_sigma=imu.gyro_gain_sigma)
+    corrected = replace(imu, angular_velocity=imu.angular_velocity * gain, gyro_gain_sigma=0.0)
+    if np.abs(gain - 1.0).max() < WORTH_SAYING:
+        return corrected, ()
+    factors = ", ".join(f"{each:.3f}" for each in gain)
+    return corrected, (f"gravity shows the gyro's gains to be off: its rates are taken times [{factors}]",)
 
 
 def _check(imu: Imu) -> None:

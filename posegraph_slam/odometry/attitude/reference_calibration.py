@@ -35,12 +35,13 @@ def calibrate_against_reference(runs: Sequence[tuple[Imu, Trajectory]]) -> ImuCa
     Each run is an IMU, still at its start, and the poses of the body in a world whose z axis points up. Robust linear
     regression of true rates on measured ones, and of measured specific forces on g times the true vertical seen from
     the body: the hand's own accelerations are taken to cancel over a run. The clocks of each run may differ by a
-    constant (`clock_offset`). The accelerometer needs poses in which each axis is tilted far (Titterton and Weston
-    2004, section 8.3). Raises `InputError` for runs that overlap by less than a hundred samples.
+    constant (`clock_offset`), whose mean is the calibration's. The accelerometer needs poses in which each axis is
+    tilted far (Titterton and Weston 2004, section 8.3). Raises `InputError` for runs that overlap by less than a
+    hundred samples.
     """
     verticals, forces, measured, true = [], [], [], []
-    for imu, reference in runs:
-        offset = clock_offset(imu, reference)
+    offsets = [clock_offset(imu, reference) for imu, reference in runs]
+    for (imu, reference), offset in zip(runs, offsets, strict=True):
         rates_in, rates_out = _rates(imu, reference, offset)
         if len(rates_in) < MIN_SAMPLES:
             problem = f"only {len(rates_in)} of its stamps are covered by the IMU"
@@ -57,6 +58,7 @@ def calibrate_against_reference(runs: Sequence[tuple[Imu, Trajectory]]) -> ImuCa
         accelerometer_offset=accelerometer[:, 3],
         accelerometer_matrix=np.asarray(np.linalg.inv(accelerometer[:, :3]), dtype=np.float64),
         gyro_matrix=gyro,
+        early_s=float(np.mean(offsets)),
     )
 
 
