@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import block_array, csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, cg
 
 from posegraph_slam.arrays import FloatArray, IntArray, read_only
@@ -50,8 +51,8 @@ def exposure_gains(samples: ExposureSamples, frames: int) -> FloatArray:
     """Return the gain (F, 3) of each of `frames` frames and channel: how much brighter it is than the mean of all.
 
     Model: log colour = log gain of the frame + log colour of the cell + noise; least squares over frames and cells
-    together, with Huber's loss on the largest residual of the three channels and a weak prior gain of 1. The prior
-    makes the geometric mean of the gains of frames that are tied together 1: the gauge. A frame alone keeps 1.
+    together, with Huber's loss on the largest residual of the three channels and a weak prior gain of 1. The mean gain
+    of frames that are tied together is 1, as if their images were averaged: the gauge. A frame alone keeps 1.
     Source: Brown and Lowe 2007, section 6 (gain compensation), with logarithms and cells in place of image overlaps.
     """
     logs = np.log(np.maximum(samples.colour.astype(np.float64), 1.0))
@@ -66,7 +67,16 @@ def exposure_gains(samples: ExposureSamples, frames: int) -> FloatArray:
         weight = HUBER / np.maximum(residual, HUBER)
         if np.abs(gains - before).max() < 1e-3:
             break
-    return np.exp(gains)
+    return _with_mean_one(np.exp(gains), csr_array((np.ones(len(cell)), (samples.frame, cell)), (frames, len(cells))))
+
+
+def _with_mean_one(gains: FloatArray, tied: csr_array) -> FloatArray:
+    """Scale the gains (F, 3) of all frames that cells (F, M) tie together so that their mean is 1."""
+    count = tied.shape[0]
+    group = connected_components(block_array([[None, tied], [tied.T, None]]), directed=False)[1][:count]
+    frames = np.bincount(group)
+    sums = np.stack([np.bincount(group, channel) for channel in gains.T], axis=1)
+    return np.asarray(gains / (sums / np.maximum(frames, 1)[:, None])[group])
 
 
 def _solve(
