@@ -11,7 +11,8 @@ def find_frames(folder: Path, kind: str, run: str, count: int, remarks: list[str
 
     Looks for `<kind><run>_<k>.png`, `<kind>_<k>.png` or `<kind><k>.png` (k from 1, any case) in the folder itself and
     in folders named `<kind>` or `<kind><run>` in it, in its `dataRGBD` and in a `dataRGBD` beside it; the first place
-    that holds a frame is taken as a whole. Frames without a stamp are left out with a remark.
+    that holds a frame is taken as a whole. Frames without a stamp are left out, and stamps without one go without, each
+    with a remark.
     """
     for place in _places(folder, kind, run):
         numbered = _numbered(place, kind, run)
@@ -19,6 +20,9 @@ def find_frames(folder: Path, kind: str, run: str, count: int, remarks: list[str
             without_stamp = sum(k > count for k in numbered)
             if without_stamp:
                 remarks.append(f"{without_stamp} {kind} frames in {place.name} have no stamp and are left out")
+            missing = [k for k in range(1, count + 1) if k not in numbered]
+            if missing:
+                remarks.append(f"{place.name} lacks {len(missing)} of {count} {kind} frames, first number {missing[0]}")
             return tuple(numbered.get(k) for k in range(1, count + 1))
     return (None,) * count
 

@@ -19,13 +19,15 @@ from posegraph_slam.sensors import RgbdFrames, RobotLog
 class DepthMaps:
     """Texture and floor on the cells of the occupancy map, each None where it was not asked for or has no images.
 
-    `alone` is what the depth camera says by itself, `fused` the laser's map with it.
+    `alone` is what the depth camera says by itself, `fused` the laser's map with it. `without_images`: a floor map was
+    asked for, but there is no depth image.
     """
 
     texture: TextureMap | None = None
     floor: FloorMap | None = None
     alone: OccupancyGrid | None = None
     fused: OccupancyGrid | None = None
+    without_images: bool = False
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -46,9 +48,10 @@ def build_depth_maps(
 
     Both share the cells of `occupancy`; without it there are none.
     """
-    if occupancy is None or log.rgbd is None:
-        return DepthMaps()
     settings, texture, floor = configuration.floor, None, None
+    wanted = settings.method is not FloorMethod.NONE and occupancy is not None
+    if occupancy is None or log.rgbd is None:
+        return DepthMaps(without_images=wanted)
     if log.rgbd.has_images:
         texture = build_texture(
             log.rgbd,
@@ -59,7 +62,7 @@ def build_depth_maps(
             executor=executor,
             progress=progress,
         )
-    if settings.method is not FloorMethod.NONE and any(log.rgbd.disparity_files):
+    if wanted and any(log.rgbd.disparity_files):
         floor = build_floor(
             log.rgbd,
             trajectory,
@@ -74,6 +77,7 @@ def build_depth_maps(
         floor=floor,
         alone=None if floor is None else floor.grid(settings),
         fused=None if floor is None else fuse_floor(occupancy, floor, settings),
+        without_images=wanted and floor is None,
     )
 
 
@@ -94,6 +98,8 @@ def floor_step(settings: FloorSettings) -> str:
 
 
 def _remarks(maps: DepthMaps) -> Iterable[str]:
+    if maps.without_images:
+        yield "no floor map: floor.method asks for one, but the log has no depth images"
     if maps.texture is not None and maps.texture.unreadable.count:
         bad = maps.texture.unreadable
         yield f"the texture map leaves out {bad.count} frames that cannot be read; the first: {bad.first}"

@@ -202,6 +202,8 @@ def test_frames_are_found_by_their_number(disparity: str, colour: str, ece276a_l
     assert found == ["1", "2", None, None, None, "6"]
     assert [file is None for file in log.rgbd.colour_files] == [True, False, True, False]
     assert any("1 disparity frames" in remark and "have no stamp" in remark for remark in log.remarks)
+    assert any("lacks 3 of 6 disparity frames, first number 3" in remark for remark in log.remarks)
+    assert any("lacks 2 of 4 rgb frames, first number 1" in remark for remark in log.remarks)
 
 
 def test_frames_of_another_run_are_not_taken(ece276a_log: Writer, tmp_path: Path) -> None:

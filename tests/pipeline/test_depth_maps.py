@@ -79,3 +79,16 @@ def test_a_broken_image_is_told_in_a_remark(simulated: Path, tmp_path: Path) -> 
     told = [remark for remark in result.remarks if broken.name in remark]
     assert [remark.split(" leaves")[0] for remark in told] == ["the texture map", "the floor map"]
     assert all("1 " in remark and "\n" not in remark for remark in told)
+
+
+def test_a_floor_map_that_cannot_be_made_is_told(simulated: Path, tmp_path: Path) -> None:
+    log_folder = tmp_path / "log"
+    shutil.copytree(simulated, log_folder)
+    shutil.rmtree(log_folder / "dataRGBD/Disparity1")
+    without = read(log_folder)
+    result = optimize(without, configured(FloorMethod.GROUND))
+    assert result.depth_maps.floor is None
+    assert [remark for remark in result.remarks if remark.startswith("no floor map")] == [
+        "no floor map: floor.method asks for one, but the log has no depth images"
+    ]
+    assert not any("no floor map" in each for each in optimize(without, configured(FloorMethod.NONE)).remarks)
