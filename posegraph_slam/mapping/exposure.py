@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import block_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, cg
 
@@ -67,16 +67,17 @@ def exposure_gains(samples: ExposureSamples, frames: int) -> FloatArray:
         weight = HUBER / np.maximum(residual, HUBER)
         if np.abs(gains - before).max() < 1e-3:
             break
-    return _with_mean_one(np.exp(gains), csr_array((np.ones(len(cell)), (samples.frame, cell)), (frames, len(cells))))
+    return _with_mean_one(np.exp(gains), samples.frame, cell)
 
 
-def _with_mean_one(gains: FloatArray, tied: csr_array) -> FloatArray:
-    """Scale the gains (F, 3) of all frames that cells (F, M) tie together so that their mean is 1."""
-    count = tied.shape[0]
-    group = connected_components(block_array([[None, tied], [tied.T, None]]), directed=False)[1][:count]
-    frames = np.bincount(group)
+def _with_mean_one(gains: FloatArray, frame: IntArray, cell: IntArray) -> FloatArray:
+    """Scale the gains (F, 3) so that the mean is 1 over all frames tied together by samples: frame and cell (S,)."""
+    frames = len(gains)
+    nodes = frames + int(cell.max()) + 1
+    tied = csr_array((np.ones(len(cell)), (frame, frames + cell)), shape=(nodes, nodes))
+    group = connected_components(tied, directed=False)[1][:frames]
     sums = np.stack([np.bincount(group, channel) for channel in gains.T], axis=1)
-    return np.asarray(gains / (sums / np.maximum(frames, 1)[:, None])[group])
+    return np.asarray(gains / (sums / np.maximum(np.bincount(group), 1)[:, None])[group])
 
 
 def _solve(
