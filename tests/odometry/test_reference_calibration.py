@@ -72,6 +72,12 @@ def test_early_stamps_are_brought_to_the_clock_of_the_reference() -> None:
     assert clock_offset(same, reference) == pytest.approx(0.0262, abs=0.002)
 
 
+def test_stamps_that_repeat_do_not_tell_a_rate() -> None:
+    imu, reference = a_run(5, late_s=0.03, faults=False)
+    held = reference.restamped(np.repeat(reference.stamps_s[::6], 6))
+    assert clock_offset(imu, held) == clock_offset(imu, reference.select(np.arange(0, len(reference), 6))) != 0.0
+
+
 def test_runs_of_different_times_are_refused() -> None:
     imu, reference = a_run(4, late_s=0.0, faults=False)
     assert clock_offset(replace(imu, stamps_s=imu.stamps_s + 1e4), reference) == 0.0

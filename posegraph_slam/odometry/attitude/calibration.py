@@ -50,14 +50,16 @@ def _prepare(imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 
 
 def _drift(elapsed: FloatArray, dt: FloatArray, rates: FloatArray, accel: FloatArray, gain: FloatArray) -> FloatArray:
-    """Differences (3 M,) of the mean accelerations of blocks `LAG_BLOCKS` apart, where no rate between is unknown."""
+    """Differences (3 M,) of the mean accelerations of blocks `LAG_BLOCKS` apart.
+
+    Left out where a rate between is unknown or a block has no samples.
+    """
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     quat_wxyz = complementary_stream(dt, rates * gain, accel, 1.0, -1.0, np.inf, identity)
     world = np.einsum("nij,nj->ni", rotation_from_wxyz(quat_wxyz), accel)
-    block = (elapsed / BLOCK_S).astype(np.int64)
-    count = np.bincount(block)
-    mean = np.stack([np.bincount(block, weights=axis) for axis in world.T], axis=1) / np.maximum(count, 1)[:, None]
-    unknown = np.cumsum(np.bincount(block, weights=~np.isfinite(rates).all(axis=1)) + (count == 0))
+    number, block = np.unique((elapsed / BLOCK_S).astype(np.int64), return_inverse=True)
+    mean = np.stack([np.bincount(block, weights=axis) for axis in world.T], axis=1) / np.bincount(block)[:, None]
+    unknown = np.cumsum(np.bincount(block, weights=~np.isfinite(rates).all(axis=1)))
     before = np.concatenate([[0.0], unknown])[: -LAG_BLOCKS - 1]
-    known = unknown[LAG_BLOCKS:] == before
+    known = (unknown[LAG_BLOCKS:] == before) & (number[LAG_BLOCKS:] - number[:-LAG_BLOCKS] == LAG_BLOCKS)
     return np.asarray((mean[LAG_BLOCKS:] - mean[:-LAG_BLOCKS])[known]).ravel()

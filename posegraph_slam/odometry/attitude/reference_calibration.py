@@ -84,7 +84,8 @@ def clock_offset(imu: Imu, reference: Trajectory) -> float:
 
 def _rates(imu: Imu, reference: Trajectory, offset: float) -> tuple[FloatArray, FloatArray]:
     """Measured rates without bias and true rates (n, 3) at the stamps of the reference that the IMU covers."""
-    R, stamps = reference.poses[:, :3, :3], reference.stamps_s
+    stamps, first = np.unique(reference.stamps_s, return_index=True)
+    R = reference.poses[first, :3, :3]
     turns = SO3.log(R[: -2 * RATE_SPAN].transpose(0, 2, 1) @ R[2 * RATE_SPAN :])
     true = turns / (stamps[2 * RATE_SPAN :] - stamps[: -2 * RATE_SPAN])[:, None]
     at = stamps[RATE_SPAN:-RATE_SPAN] - offset
