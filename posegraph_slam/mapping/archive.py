@@ -44,11 +44,14 @@ def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
     return buffer.getvalue()
 
 
-def read_npz(path: Path, names: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
-    """Read the arrays `names` of an .npz archive; InputError names the file and what is wrong with it."""
+def read_npz(path: Path, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, npt.NDArray[Any]]:
+    """Read the arrays `names` of an .npz archive, and those of `optional` that it has.
+
+    InputError names the file and what is wrong with it.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in names}
+            return {name: archive[name] for name in (*names, *(name for name in optional if name in archive))}
     except FileNotFoundError as error:
         raise InputError(path, "no such file") from error
     except KeyError as error:

@@ -10,7 +10,7 @@ from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import Trajectory
 from posegraph_slam.mapping.archive import npz_bytes, read_npz, replace_file
 from posegraph_slam.odometry.scan_matching import ScanMatchingResult
-from posegraph_slam.odometry.wheel_calibration import WheelCalibration
+from posegraph_slam.odometry.wheel_calibration import UNCALIBRATED, WheelCalibration
 
 MATCHING = "scan_matching.npz"
 CLOCKS = ("lag", "sweep")
@@ -28,13 +28,19 @@ def write_matching(matched: ScanMatchingResult, path: Path) -> None:
 
 
 def read_matching(path: Path, scans: int) -> ScanMatchingResult:
-    """Read the scan matching of a log of `scans` scans; InputError where the file is of another log."""
-    arrays = read_npz(path, ("stamps_s", "poses", "wheels", *CLOCKS, *ARRAYS))
+    """Read the scan matching of a log of `scans` scans; InputError where the file is of another log.
+
+    Files without `wheels` are of runs whose wheels were not calibrated.
+    """
+    arrays = read_npz(path, ("stamps_s", "poses", *CLOCKS, *ARRAYS), optional=("wheels",))
     count = len(arrays["stamps_s"])
     if count != scans:
         raise InputError(path, f"holds {count} scans, but the log has {scans}", "give the run directory of this log")
     if arrays["poses"].shape != (count, 3, 3) or not np.isfinite(arrays["poses"]).all():
         raise InputError(path, "does not hold finite planar poses", "run `psg optimize` again to write it")
+    wheels = arrays.get("wheels")
+    if wheels is not None and (wheels.shape != (len(WHEELS),) or not (np.isfinite(wheels[0]) and (wheels > 0).all())):
+        raise InputError(path, "does not hold a calibration of wheels", "run `psg optimize` again to write it")
     trajectory = Trajectory(stamps_s=arrays["stamps_s"], poses=arrays["poses"], parent="odom", child="base")
     return ScanMatchingResult(
         trajectory=trajectory,
@@ -45,5 +51,5 @@ def read_matching(path: Path, scans: int) -> ScanMatchingResult:
         searched=arrays["searched"],
         lag=float(arrays["lag"]),
         sweep=float(arrays["sweep"]),
-        wheels=WheelCalibration(**dict(zip(WHEELS, arrays["wheels"].tolist(), strict=True))),
+        wheels=UNCALIBRATED if wheels is None else WheelCalibration(**dict(zip(WHEELS, wheels.tolist(), strict=True))),
     )

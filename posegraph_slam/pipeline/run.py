@@ -81,6 +81,11 @@ def _taken_over(
     if under_way.log.scans is None:
         raise InputError(matching_of, "is the run of a log without laser scans", "start it over at `matching`")
     earlier = read_run_directory(matching_of)
+    group = earlier.configuration.pose_graph.group
+    if group != configuration.pose_graph.group:
+        # in space the scans are matched in the frame of a level scanner, not of the base
+        problem = f"was matched with pose_graph.group = {group}, not {configuration.pose_graph.group}"
+        raise InputError(matching_of, problem, "start it over at `matching`")
     matched = read_matching(earlier.path(MATCHING), len(under_way.log.scans))
     if edits is None:
         return matched, None

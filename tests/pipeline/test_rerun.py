@@ -12,6 +12,8 @@ import pytest
 from posegraph_slam.datasets.simulation import simulate, tiny_settings
 from posegraph_slam.datasets.tum import read_tum
 from posegraph_slam.errors import ConfigurationError, InputError
+from posegraph_slam.mapping.archive import npz_bytes
+from posegraph_slam.odometry.wheel_calibration import UNCALIBRATED
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.matching_file import MATCHING, read_matching
 from posegraph_slam.pipeline.rerun import plan_run
@@ -67,6 +69,27 @@ def test_wrong_stages_and_runs_are_named(finished: Path, tmp_path: Path) -> None
     (moved / "run.json").write_text(json.dumps(record))
     with pytest.raises(InputError, match="is gone"):
         plan_run(moved, [], [], start="graph")
+
+
+def test_matching_without_wheels_is_of_wheels_as_they_are(finished: Path, tmp_path: Path) -> None:
+    arrays = dict(np.load(finished / MATCHING))
+    count = len(arrays["stamps_s"])
+    matched = read_matching(finished / MATCHING, count)
+    wheels = arrays.pop("wheels")
+    (tmp_path / MATCHING).write_bytes(npz_bytes(arrays))
+    earlier = read_matching(tmp_path / MATCHING, count)
+    assert earlier.wheels == matched.wheels == UNCALIBRATED
+    for bad in (wheels[:2], np.array([np.nan, 0.1, 0.1]), np.array([-1.0, 0.1, 0.1])):
+        (tmp_path / MATCHING).write_bytes(npz_bytes({**arrays, "wheels": bad}))
+        with pytest.raises(InputError, match="does not hold a calibration of wheels"):
+            read_matching(tmp_path / MATCHING, count)
+
+
+def test_matching_in_the_plane_is_not_taken_for_one_in_space(finished: Path, tmp_path: Path) -> None:
+    plan = plan_run(finished, [], ["pose_graph.group=se3"], start="graph")
+    with pytest.raises(InputError, match="was matched with pose_graph.group = se2, not se3; start it over"):
+        run(plan.log, plan.configuration, out=tmp_path / "space", matching_of=plan.matching_of)
+    assert not (tmp_path / "space").exists()
 
 
 def test_matching_of_another_log_is_refused(finished: Path, tmp_path: Path) -> None:
