@@ -87,7 +87,7 @@ def test_matching_without_wheels_is_of_wheels_as_they_are(finished: Path, tmp_pa
 
 def test_matching_in_the_plane_is_not_taken_for_one_in_space(finished: Path, tmp_path: Path) -> None:
     plan = plan_run(finished, [], ["pose_graph.group=se3"], start="graph")
-    with pytest.raises(InputError, match="was matched with pose_graph.group = se2, not se3; start it over"):
+    with pytest.raises(InputError, match=r"was matched with pose_graph\.group = se2, not se3; start it over"):
         run(plan.log, plan.configuration, out=tmp_path / "space", matching_of=plan.matching_of)
     assert not (tmp_path / "space").exists()
 
