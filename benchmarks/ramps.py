@@ -1,6 +1,7 @@
 """Poses in space and levelled maps on simulated floors with ramps of 18 to 20 degrees, beside the flat pipeline.
 
     python benchmarks/ramps.py [--worlds one high] [--seeds 5]
+    python benchmarks/ramps.py --picture          # docs/images/ramps.png: both maps of `psg simulate --world ramps`
 
 Each log is optimised twice, in the plane and in space. False cells are occupied cells further than 0.15 m from every
 obstacle of the world, with the map laid onto the truth by the trajectory. Writes benchmarks/results/ramps.json and,
@@ -11,11 +12,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from posegraph_slam.datasets.simulation import RampSettings, SimulationSettings, WorldSettings, ramp_settings
 from posegraph_slam.datasets.simulation.run import drive, simulate_run
@@ -24,10 +27,12 @@ from posegraph_slam.evaluation.ape import absolute_pose_error
 from posegraph_slam.geometry import align_points, transform_points
 from posegraph_slam.pipeline.configuration import load_configuration
 from posegraph_slam.pipeline.optimize import OptimizationResult, optimize
+from posegraph_slam.report.figures import draw_map
 from posegraph_slam.sensors import RobotLog
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, PAGE = ROOT / "benchmarks" / "results" / "ramps.json", ROOT / "docs" / "benchmarks.md"
+PICTURE, PICTURE_WIDTH = ROOT / "docs" / "images" / "ramps.png", 1800
 BEGIN, END = "<!-- ramps: begin -->", "<!-- ramps: end -->"
 MARGIN_M = 0.15
 WORLDS = {
@@ -84,6 +89,23 @@ def measure(name: str, settings: SimulationSettings) -> dict[str, Any]:
     return row
 
 
+def draw_picture() -> None:
+    """Draw the maps of one log side by side, in the plane and in space."""
+    log, pictures = drive(ramp_settings()), []
+    with tempfile.TemporaryDirectory() as folder:
+        for group in ("se2", "se3"):
+            result = optimize(log, load_configuration([], [f"pose_graph.group={group}", "workers=1"]))
+            assert result.occupancy is not None
+            draw_map(result.occupancy, Path(folder) / f"{group}.png", trajectory=result.trajectory.spatial())
+            pictures.append(Image.open(Path(folder) / f"{group}.png").convert("RGB"))
+    joined = Image.new("RGB", (sum(each.width for each in pictures), max(each.height for each in pictures)), "white")
+    left = 0
+    for each in pictures:
+        joined.paste(each, (left, joined.height - each.height))
+        left += each.width
+    joined.resize((PICTURE_WIDTH, round(PICTURE_WIDTH * joined.height / joined.width))).quantize(64).save(PICTURE)
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Write one line a log."""
     lines = [
@@ -105,7 +127,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), help="beginnings of the worlds' names")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--picture", action="store_true", help="draw the picture of docs/se3.md instead")
     arguments = parser.parse_args()
+    if arguments.picture:
+        draw_picture()
+        return
     rows = []
     for name in (name for name in WORLDS if any(name.startswith(wanted) for wanted in arguments.worlds)):
         for seed in range(1, arguments.seeds + 1):
