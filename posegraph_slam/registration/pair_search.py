@@ -63,7 +63,7 @@ def pair_nearest(
             if not (held > 0 and within > 0 and squares[0] < within**2 * (1 - 1e-12)):
                 bound = min(limit, squares[KNOWN - 1]) if held == KNOWN else limit
                 held = search_near(x, y, z, rows, leaves, axis, value, bound, near, squares, stack, bounds)
-                reach[k, 1] = np.sqrt(squares[KNOWN - 1]) if held == KNOWN else gate
+                reach[k, 1] = np.sqrt(squares[KNOWN - 1] if held == KNOWN else bound)
             reach[k, 0] = min(np.sqrt(squares[1]), reach[k, 1]) if held > 1 else reach[k, 1]
             for j in range(KNOWN):
                 known[k, j] = near[j] if j < held else -1

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from posegraph_slam.arrays import FloatArray
 from posegraph_slam.geometry import SE2, SE3, Group
 from posegraph_slam.registration.cloud import prepare_cloud
 from posegraph_slam.registration.icp import pose_in_space
@@ -57,6 +58,31 @@ def test_pairs_stay_the_nearest_ones_on_every_way(dimension: int, linked: bool) 
         expected = np.flatnonzero(squares.min(axis=1) <= gate**2)
         np.testing.assert_array_equal(s[:count], expected)
         np.testing.assert_array_equal(t[:count], squares.argmin(axis=1)[expected])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_rounding_hides_no_point_as_near_as_the_bound_of_a_search(dimension: int) -> None:
+    rng, gate = np.random.default_rng(0), 10.0
+    s, t, square = np.empty(99, dtype=np.int64), np.empty(99, dtype=np.int64), np.empty(99)
+    for _ in range(40):
+        # points in twenty copies: the fourth nearest one, which bounds the search, is as near as the first
+        points = rng.uniform(0, 3, (40, dimension))[rng.integers(0, 40, 800)]
+        source, target = (prepare_cloud(p) for p in (points[rng.integers(0, 800, 99)], points))
+        memory, T, tree = nothing_known(99), np.eye(4), target.tree
+        for _ in range(4):
+            T[:dimension, 3] += rng.normal(0, 0.1, dimension)
+            count = pair_nearest(T, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis,
+                                 tree.value, target.surface.neighbours, gate, *memory, s, t, square)  # fmt: skip
+            squares = np.sum((source.in_space[:, None] + T[:3, 3] - target.in_space[None]) ** 2, axis=2)
+            assert count == 99
+            np.testing.assert_array_equal(t, squares.argmin(axis=1))
+
+
+@pytest.mark.parametrize("points", [np.zeros((1, 2)), np.zeros((2, 3)), np.zeros((0, 2))])
+def test_clouds_too_small_for_lines_or_planes_have_no_neighbours(points: FloatArray) -> None:
+    surface = prepare_cloud(points).surface
+    assert surface.neighbours.shape == (len(points), 0)
+    assert not surface.oriented.any()
 
 
 @pytest.mark.parametrize("group", [SE2, SE3], ids=["SE2", "SE3"])
