@@ -38,8 +38,8 @@ STATUSES = {
 }
 FAILURES = (RegistrationStatus.TOO_FEW_INLIERS, RegistrationStatus.DEGENERATE)
 
-RIGID_TOLERANCE = 2e-3
-"""How far the axes of a guess may be from unit length and right angles."""
+RIGID_TOLERANCE, RIGID_ROUNDING = 2e-3, 1e-12
+"""How far the axes of a guess may be from unit length and right angles, and how far without being corrected."""
 
 NO_NORMALS = read_only(np.zeros((1, 3)))
 NO_SURFACE = Surface(
@@ -182,9 +182,10 @@ def _prepared(cloud: FloatArray | Cloud, settings: IcpSettings) -> Cloud:
 
 
 def checked_pose(T_target_source: FloatArray, source: Cloud, target: Cloud) -> FloatArray:
-    """Return the guess (d+1, d+1) if it fits both clouds and is a rigid motion.
+    """Return the guess (d+1, d+1) if it fits both clouds and is a rigid motion to three digits, as files may hold it.
 
-    A Gauss-Newton loop that starts at a reflection or a scaling would end at one.
+    A Gauss-Newton loop that starts at a reflection or a scaling would end at one, which is why digits that were cut
+    off are made up for: the rotation becomes the nearest one.
     """
     if source.dimension != target.dimension:
         raise InputError("registration", f"source points have {source.dimension} coordinates, target points "
@@ -194,33 +195,39 @@ def checked_pose(T_target_source: FloatArray, source: Cloud, target: Cloud) -> F
     if T.shape != (size, size) or not math.isfinite(np.vdot(T, T)):  # a fifth of the time of np.isfinite(T).all()
         problem = f"the initial T_target_source of shape {T.shape} is not a finite pose of {source.dimension}D points"
         raise InputError("registration", problem, f"give a {size} x {size} matrix")
-    if not is_rigid(T):
+    off = distance_from_rigid(T)
+    if off > RIGID_TOLERANCE:
         problem = "the initial T_target_source is no rigid motion: it scales, shears or reflects"
         raise InputError("registration", problem, "give a rotation and a translation")
+    if off > RIGID_ROUNDING:
+        R = T[:-1, :-1]
+        for _ in range(3):  # each squares the distance (Bjorck and Bowie 1971): 2e-3 becomes less than rounding
+            R[:] = R @ (1.5 * np.eye(len(R)) - 0.5 * R.T @ R)
     return T
 
 
 @kernel
-def is_rigid(T: FloatArray) -> bool:
-    """Whether T (d+1, d+1), d = 2 or 3, is a rotation and a translation to three digits, as text files may hold it."""
+def distance_from_rigid(T: FloatArray) -> float:
+    """Largest entry of R^T R - 1 for R in T (d+1, d+1); infinite if T reflects or its last row is not 0, .., 0, 1."""
     d = len(T) - 1
+    largest = 0.0
     for a in range(d):
         for b in range(d):
             product = -1.0 if a == b else 0.0
             for c in range(d):
                 product += T[c, a] * T[c, b]
-            if abs(product) > RIGID_TOLERANCE:
-                return False
+            largest = max(largest, abs(product))
         if T[d, a] != 0.0:
-            return False
+            return np.inf
     if d == 2:
-        return bool(T[0, 0] * T[1, 1] > T[0, 1] * T[1, 0] and T[2, 2] == 1.0)
-    across = (
-        T[0, 0] * (T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1])
-        + T[0, 1] * (T[1, 2] * T[2, 0] - T[1, 0] * T[2, 2])
-        + T[0, 2] * (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0])
-    )
-    return bool(across > 0.0 and T[3, 3] == 1.0)
+        volume = T[0, 0] * T[1, 1] - T[0, 1] * T[1, 0]
+    else:
+        volume = (
+            T[0, 0] * (T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1])
+            + T[0, 1] * (T[1, 2] * T[2, 0] - T[1, 0] * T[2, 2])
+            + T[0, 2] * (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0])
+        )
+    return largest if volume > 0.0 and T[d, d] == 1.0 else np.inf
 
 
 def _source_normals(source: Cloud, settings: IcpSettings) -> FloatArray:

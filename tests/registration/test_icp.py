@@ -257,6 +257,16 @@ def test_the_layout_of_the_guess_compiles_nothing_anew(group: Group) -> None:
     assert len(register.signatures) == compiled
 
 
+@spaces
+@pytest.mark.parametrize("residual", ResidualKind)
+def test_a_guess_of_three_digits_ends_at_a_rotation(group: Group, residual: ResidualKind) -> None:
+    target, T, settings = surface(group), motion(group, 0.3, 1), IcpSettings(residual=residual)
+    result = icp(transform_points(inverse_pose(T), target), target, np.round(T, 3), settings)
+    R = result.T_target_source[:-1, :-1]
+    np.testing.assert_allclose(R.T @ R, np.eye(len(R)), atol=1e-12)
+    assert distance(group, result.T_target_source, T) < 1e-5
+
+
 def test_too_few_steps_are_told() -> None:
     target = surface(SE2)
     source = transform_points(motion(SE2, 0.2, 1), surface(SE2, 7))
