@@ -40,16 +40,6 @@ def robust_slope(loss: int, u: float) -> float:
 
 
 @kernel
-def tangent_row(d: int, arm: FloatArray, n: FloatArray, row: FloatArray) -> None:
-    """Write the derivative (p,) of a distance along n for a right update about the point that `arm` starts from."""
-    if d == 2:
-        row[0], row[1], row[2] = n[0], n[1], arm[0] * n[1] - arm[1] * n[0]
-        return
-    row[0], row[1], row[2] = arm[1] * n[2] - arm[2] * n[1], arm[2] * n[0] - arm[0] * n[2], arm[0] * n[1] - arm[1] * n[0]
-    row[3], row[4], row[5] = n[0], n[1], n[2]
-
-
-@kernel
 def centre_and_radius(points: FloatArray, chosen: IntArray, count: int, d: int) -> tuple[FloatArray, float]:
     """Mean (3,) and root mean square radius of rows `chosen[:count]` of points (n, 3).
 
