@@ -71,7 +71,7 @@ def _gives_a_point(line: str, delimiter: str | None, columns: list[int]) -> bool
 
 
 def _words(line: str, delimiter: str | None) -> list[str]:
-    return [word.strip().strip('"') for word in line.split(delimiter) if word.strip()]
+    return [word.strip().strip('"') for word in line.split(delimiter)]
 
 
 def _is_number(word: str) -> bool:
@@ -79,4 +79,4 @@ def _is_number(word: str) -> bool:
         float(word)
     except ValueError:
         return False
-    return "_" not in word
+    return "_" not in word and word.isascii()  # Python reads more than NumPy

@@ -149,6 +149,7 @@ ROWS = "1 2 3\n4 5 6\n"
     ("a.xyz", ROWS.replace("\n", "\r\n")),
     ("a.xyz", "\ufeff" + ROWS),
     ("a.csv", '"x","y","z"\n' + ROWS.replace(" ", ",")),
+    ("a.csv", ",x,y,z\n0,1,2,3\n1,4,5,6\n"),
     ("a.csv", ROWS),
     ("a.txt", "X,Y,Z,intensity\n" + ROWS.replace(" ", ",").replace("\n", ",9\n")),
 ])  # fmt: skip
@@ -168,6 +169,7 @@ def test_text_is_read_with_and_without_header(tmp_path: Path, name: str, text: s
     (ROWS + "# here\n7 8 word\n", r"a\.xyz:4: '7 8 word' gives no point"),
     ("0,5 1,5 2,5\n0,5 1,5 2,5\n", r"a\.xyz:1: "),
     ("one two 3\n" + ROWS, r"a\.xyz:1: "),
+    (ROWS + "\u0661 2 3\n", r"a\.xyz:3: "),
 ])  # fmt: skip
 def test_text_without_points_is_named_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:
     (tmp_path / "a.xyz").write_text(text)
