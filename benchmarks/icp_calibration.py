@@ -1,13 +1,12 @@
 """Whether the information of a registration tells the truth: mean normalised error squared over noisy trials.
 
-    python benchmarks/icp_calibration.py [--data FOLDER] [--trials 200] [--seed 1]
+    python benchmarks/icp_calibration.py [--data FOLDER] [--trials 200] [--seed 1] [--rooms-only]
                                          [--out benchmarks/results/icp_calibration.json]
 
 Rooms are simulated scans of 181 to 1081 beams with a random place, motion and guess a trial; every case has its own
-random numbers. The second room is an L with a slanted wall, a pillar and a turned box. On
-the LiDAR pair the truth is known because both clouds of a trial are drawn from the same points: two random parts of
-2500 points each, of the target scan or of both scans joined by the pose that comes with them, one moved, both with
-noise added.
+random numbers. The second room is an L with a slanted wall, a pillar and a turned box. On the LiDAR pair the truth is
+known because both clouds of a trial are drawn from the same points: two random parts of 2500 points each, of the target
+scan or of both scans joined by the pose that comes with them, one moved, both with noise added.
 """
 
 from __future__ import annotations
