@@ -52,6 +52,17 @@ def test_normals_of_a_round_thing_point_outward(group: Group) -> None:
     assert np.quantile(cosine, 0.01) > 0.99
 
 
+def test_rows_of_one_scan_line_are_widened_until_they_hold_a_plane() -> None:
+    rng = np.random.default_rng(0)
+    along, across = np.meshgrid(np.arange(0.0, 4.0, 0.02), np.arange(0.0, 3.0, 0.15))
+    points = np.stack([along.ravel(), across.ravel(), np.zeros(along.size)], axis=1)
+    surface = prepare_cloud(points + rng.normal(0, 0.002, points.shape), neighbours=10).surface
+    assert surface.neighbours.shape[1] == 20
+    assert np.quantile(np.abs(surface.normals[:, 2]), 0.02) > np.cos(np.radians(3))
+    thinned = prepare_cloud(points[rng.permutation(len(points))[:400]], neighbours=10).surface
+    assert thinned.neighbours.shape[1] == 10
+
+
 @spaces
 def test_fits_keep_their_digits_far_away(group: Group) -> None:
     points = np.random.default_rng(0).normal(size=(60, group.dimension)) * 0.1
