@@ -1,4 +1,4 @@
-"""Thinning of dense clouds to one point a voxel."""
+"""Thinning of dense clouds to one point a voxel, and of scan lines until they are no denser than they are apart."""
 
 from __future__ import annotations
 
@@ -6,7 +6,15 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import InputError
+from posegraph_slam.registration.cloud import Cloud, prepare_cloud
+from posegraph_slam.registration.surface import LONGEST_SHARE, shape_of_neighbourhoods
 from posegraph_slam.registration.voxel_hash import AXIS_BITS, voxel_keys
+
+EVEN_SHARE = 1.6
+"""Median length of neighbourhoods over their width up to which points count as spread evenly, for which it is 1.5."""
+
+FEWEST = 1000
+"""Points that are left at least."""
 
 
 def downsample(points: FloatArray, voxel_m: float) -> FloatArray:
@@ -23,3 +31,25 @@ def downsample(points: FloatArray, voxel_m: float) -> FloatArray:
     keys = voxel_keys(points, np.floor(points.min(axis=0) / voxel_m) * voxel_m, voxel_m)
     _, member, counts = np.unique(keys, return_inverse=True, return_counts=True)
     return np.column_stack([np.bincount(member, points[:, a]) / counts for a in range(points.shape[1])])
+
+
+def thin_scan_lines(cloud: Cloud) -> Cloud:
+    """Thin a cloud in space whose points lie on few dense lines until they are spread evenly; others are left alone.
+
+    Of a scan of 64 lines most points lie on the few lines near the scanner: they would outvote all walls, and
+    neighbours on one line hold no plane. The voxel grows by the root of two from half the neighbours' reach.
+    """
+    if cloud.dimension != 3 or len(cloud) <= FEWEST:
+        return cloud
+    shape, reach = shape_of_neighbourhoods(cloud.points, cloud.tree, cloud.neighbours)
+    if shape <= LONGEST_SHARE:
+        return cloud
+    thinned, voxel_m = cloud, reach / 2
+    while shape > EVEN_SHARE:
+        coarser = downsample(cloud.points, voxel_m)
+        if len(coarser) < FEWEST:
+            break
+        thinned = prepare_cloud(coarser, neighbours=cloud.neighbours)
+        shape, _ = shape_of_neighbourhoods(thinned.points, thinned.tree, thinned.neighbours)
+        voxel_m *= np.sqrt(2.0)
+    return thinned

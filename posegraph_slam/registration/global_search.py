@@ -12,6 +12,7 @@ from posegraph_slam.arrays import FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import inverse_pose, transform_points
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
+from posegraph_slam.registration.downsampling import thin_scan_lines
 from posegraph_slam.registration.fit import trimmed_rmse
 from posegraph_slam.registration.icp import failed, icp
 from posegraph_slam.registration.many_starts import descend_all
@@ -86,9 +87,10 @@ class GlobalRegistration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedTarget:
-    """A target ready for searches: its cloud and its table of nearest points."""
+    """A target ready for searches: its cloud, the part that is matched (`thin_scan_lines`) and its nearest points."""
 
     cloud: Cloud
+    matched: Cloud
     field: NearestField
 
 
@@ -97,7 +99,10 @@ def prepare_target(points: FloatArray, settings: GlobalSearchSettings = DEFAULT_
     cloud = prepare_cloud(points)
     if cloud.dimension != 3 or len(cloud) < 4:
         raise InputError("global registration", f"the target has shape {cloud.points.shape}", "give (points, 3)")
-    return PreparedTarget(cloud=cloud, field=build_nearest_field(cloud.points, settings.field_voxels))
+    matched = thin_scan_lines(cloud)
+    return PreparedTarget(
+        cloud=cloud, matched=matched, field=build_nearest_field(matched.points, settings.field_voxels)
+    )
 
 
 def register_globally(
@@ -109,25 +114,27 @@ def register_globally(
     ICP on a table of nearest points with few points; the best go on with more (successive halving); the last few
     distinct ones are refined to the tangent planes, and the one of least trimmed distance wins, the first of equals.
     Nothing is random: the same input gives the same bytes. Clouds that are too poor, or fit nowhere, end in a status.
+    Of clouds of dense scan lines an even part is matched (`thin_scan_lines`), whose inliers the result counts.
     """
     prepared = target if isinstance(target, PreparedTarget) else prepare_target(target, settings)
-    cloud = prepare_cloud(source)
+    whole = prepare_cloud(source)
+    cloud = thin_scan_lines(whole)
     if cloud.dimension != 3:
         raise InputError("global registration", f"the source has shape {cloud.points.shape}", "give (points, 3)")
     if len(cloud) < 10:
         return _nothing(RegistrationStatus.TOO_FEW_POINTS)
-    if not (cloud.spans_plane and prepared.cloud.spans_plane):
+    if not (cloud.spans_plane and prepared.matched.spans_plane):
         return _nothing(RegistrationStatus.DEGENERATE)
     T_source_frame = source_frame(cloud.points, settings)
     points = transform_points(inverse_pose(T_source_frame), cloud.points)
-    starts = make_starts(points, prepared.cloud.points.mean(axis=0), settings)
+    starts = make_starts(points, prepared.matched.points.mean(axis=0), settings)
     poses, origin, roughly = thin_out(starts, points, prepared.field, settings)
     radius = float(np.sqrt(np.sum(points**2, axis=1).mean()))
     if roughly > ROUGHLY * settings.rmse_limit_share * radius:
         return _nothing(RegistrationStatus.TOO_FEW_INLIERS, len(starts))
-    T, start, rmse = choose(points, poses, origin, prepared.cloud, settings)
-    result = refine(cloud, prepared.cloud, T @ inverse_pose(T_source_frame), rmse, settings)
-    final = trimmed_rmse(cloud.points, prepared.cloud, result.T_target_source, settings.keep_fraction)
+    T, start, rmse = choose(points, poses, origin, prepared.matched, settings)
+    result = refine(cloud, prepared.matched, T @ inverse_pose(T_source_frame), rmse, settings)
+    final = trimmed_rmse(whole.points, prepared.cloud, result.T_target_source, settings.keep_fraction)
     if not result.usable or final > settings.rmse_limit_share * radius:
         return _nothing(result.status if not result.usable else RegistrationStatus.TOO_FEW_INLIERS, len(starts))
     return GlobalRegistration(result=result, start=start, starts=len(starts), trimmed_rmse_m=final,

@@ -74,6 +74,16 @@ def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
                    neighbours=frozen(index))  # fmt: skip
 
 
+def shape_of_neighbourhoods(points: FloatArray, tree: KdTree, neighbours: int) -> tuple[float, float]:
+    """Median length over width of the `neighbours` nearest points of all points (n, 3), and median of their reach.
+
+    Points that are spread evenly over a surface have a length of 1.5 times the width.
+    """
+    index = neighbours_of_all(tree.rows, tree.sorted_points, tree.axis, tree.value, min(neighbours, len(points)))
+    reach = np.linalg.norm(points[index[:, -1]] - points, axis=1)
+    return float(fit_neighbourhoods(points, index)[5]), float(np.median(reach))
+
+
 @kernel
 def fit_all(
     points: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray, value: FloatArray, count: int

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3, Group, align_points
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
+from posegraph_slam.registration.downsampling import EVEN_SHARE, thin_scan_lines
 from posegraph_slam.registration.icp import has_settled
 from posegraph_slam.registration.pairing import (
     Association,
@@ -25,6 +26,7 @@ from posegraph_slam.registration.pairing import (
 )
 from posegraph_slam.registration.residuals import PointToPlane, PointToPoint, linearise, plane_residuals
 from posegraph_slam.registration.settings import IcpSettings
+from posegraph_slam.registration.surface import shape_of_neighbourhoods
 
 searches = pytest.mark.parametrize("search", [by_tree, by_voxel_hash])
 spaces = pytest.mark.parametrize("group", [SE2, SE3], ids=["2d", "3d"])
@@ -59,8 +61,21 @@ def test_rows_of_one_scan_line_are_widened_until_they_hold_a_plane() -> None:
     surface = prepare_cloud(points + rng.normal(0, 0.002, points.shape), neighbours=10).surface
     assert surface.neighbours.shape[1] == 20
     assert np.quantile(np.abs(surface.normals[:, 2]), 0.02) > np.cos(np.radians(3))
-    thinned = prepare_cloud(points[rng.permutation(len(points))[:400]], neighbours=10).surface
-    assert thinned.neighbours.shape[1] == 10
+    even = prepare_cloud(points[rng.permutation(len(points))[:400]], neighbours=10).surface
+    assert even.neighbours.shape[1] == 10
+
+
+def test_dense_scan_lines_are_thinned_until_they_are_even() -> None:
+    rng = np.random.default_rng(0)
+    along, across = np.meshgrid(np.arange(0.0, 6.0, 0.01), np.arange(0.0, 6.0, 0.15))
+    points = np.stack([along.ravel(), across.ravel(), np.zeros(along.size)], axis=1)
+    thinned = thin_scan_lines(prepare_cloud(points + rng.normal(0, 0.002, points.shape)))
+    assert len(np.unique(np.round(thinned.points[:, 1] / 0.15))) == 40  # all lines are left
+    assert 3000 < len(thinned) < 8000
+    assert shape_of_neighbourhoods(thinned.points, thinned.tree, 10)[0] <= EVEN_SHARE
+    for few_or_even in (prepare_cloud(points[::40]), prepare_cloud(rng.uniform(0, 1, (3000, 3)) * [6, 6, 0.01]),
+                        prepare_cloud(points[:, :2])):  # fmt: skip
+        assert thin_scan_lines(few_or_even) is few_or_even
 
 
 @spaces

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from posegraph_slam.datasets.clouds import read_cloud
-from posegraph_slam.geometry import SE3
-from posegraph_slam.registration import IcpSettings, downsample, icp, prepare_cloud
+from posegraph_slam.geometry import SE3, transform_points
+from posegraph_slam.registration import IcpSettings, downsample, icp, prepare_cloud, register_globally
 
 pytestmark = pytest.mark.data
 
@@ -34,6 +34,20 @@ def test_the_lidar_pair(psg_data: Path, voxel_m: float, settings: IcpSettings) -
             assert result.usable
             assert np.linalg.norm(error[3:]) <= 0.02
             assert np.degrees(np.linalg.norm(error[:3])) <= 0.2
+
+
+def test_the_lidar_pair_as_it_is_needs_no_guess(psg_data: Path) -> None:
+    folder = psg_data / "clouds" / "lidar_pair"
+    T = np.loadtxt(folder / "T_target_source.txt")
+    source, target = (read_cloud(folder / f"{name}.ply").points for name in ("source", "target"))
+    motion = SE3.exp(np.array([0.4, -1.0, 2.0, 3.0, -7.0, 1.0]))
+    moved = transform_points(SE3.inverse(motion), source)
+    for a, b, truth in ((moved, target, T @ motion), (target, source, SE3.inverse(T))):
+        found = register_globally(a, b)
+        error = SE3.local(truth, found.result.T_target_source)
+        assert found.result.usable
+        assert np.linalg.norm(error[3:]) <= 0.02
+        assert np.degrees(np.linalg.norm(error[:3])) <= 0.2
 
 
 def test_dense_scan_lines_do_not_hold_each_other(psg_data: Path) -> None:
