@@ -29,7 +29,8 @@ class FilterState:
 
     `anchor` is the last pose that was known, moved on by odometry since, and its covariance; it is what a lost robot
     falls back to. `recent` are the last scans that weighed the particles, each with its odometry pose (3,). At the
-    last search every other place fitted worse than hypothesis `favourite`, by `margin` in log-odds a return.
+    last search every other place fitted worse than hypothesis `favourite`, by `margin` in log-odds a return, and the
+    best of them like one where the share `rival_agreement` of all returns agrees and the others conflict.
     """
 
     particles: Particles
@@ -42,6 +43,7 @@ class FilterState:
     recent: tuple[tuple[FloatArray, ScanPoints], ...]
     favourite: int = -1
     margin: float = -math.inf
+    rival_agreement: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

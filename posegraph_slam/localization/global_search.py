@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from posegraph_slam.arrays import ByteArray, FloatArray
 from posegraph_slam.jit import kernel
@@ -12,7 +13,6 @@ from posegraph_slam.localization.map_field import FREE, OCCUPIED, MapField
 from posegraph_slam.localization.settings import GlobalSearchSettings
 from posegraph_slam.registration.correlative import (
     FIELD_MAX,
-    block_score,
     insert_block,
     likelihood_field,
     max_pooled,
@@ -25,25 +25,41 @@ LEVELS = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SearchStack:
-    """Max-pooled likelihood (L, R, C) and free space (L, R, C) of a map at the resolution of the search."""
+    """Max-pooled likelihood (L, R, C) and free space (L, R, C) of a map at the resolution of the search.
 
-    likelihood: ByteArray
+    The likelihood is that of a return in each cell less `unknown`, that of one in unknown space or beyond the map.
+    The map is padded by `pad` cells, so that no return within the range of the search lies outside.
+    """
+
+    likelihood: npt.NDArray[np.int16]
     free: ByteArray
+    unknown: int
+    pad: int
     resolution_m: float
 
 
 def build_search_stack(field: MapField, settings: GlobalSearchSettings) -> SearchStack:
-    """Prepare a map for `find_places`; poses are only looked for in its known free space."""
+    """Prepare a map for `find_places`; poses are only looked for in its known free space.
+
+    A return in unknown space neither fits nor conflicts. Were it to count as one in free space, a place whose
+    surroundings are mapped in part would score less than many wrong ones that are mapped all around.
+    """
     fine = field.geometry.resolution_m
     step = max(settings.resolution_m, fine)
     rows, columns = (int(np.ceil(n * fine / step)) for n in field.geometry.shape)
-    pad = 1 << LEVELS
+    pad = (1 << LEVELS) + int(np.ceil(settings.range_max_m / step)) + 1
     cells = np.argwhere(field.kind == OCCUPIED)[:, ::-1]
     likelihood = likelihood_field((cells + 0.5) * fine, np.zeros(2), step, rows, columns, pad, settings.sigma_m)
     free = np.zeros_like(likelihood)
     free_cells = np.floor((np.argwhere(field.kind == FREE) + 0.5) * (fine / step)).astype(np.int64)
     free[free_cells[:, 0] + pad, free_cells[:, 1] + pad] = 1
-    return SearchStack(likelihood=max_pooled(likelihood, LEVELS), free=max_pooled(free, LEVELS), resolution_m=step)
+    unknown = round(settings.unknown_likelihood * FIELD_MAX)
+    relative = likelihood.astype(np.int16) - unknown
+    np.maximum(relative, 0, out=relative, where=free == 0)
+    return SearchStack(
+        likelihood=max_pooled(relative, LEVELS), free=max_pooled(free, LEVELS), unknown=unknown, pad=pad,
+        resolution_m=step,
+    )  # fmt: skip
 
 
 def find_places(
@@ -62,12 +78,13 @@ def find_places(
     turn = max(stack.resolution_m / max(farthest, 1.0), settings.angle_step_rad)
     angles = np.arange(int(np.ceil(2 * np.pi / turn))) * turn
     start = np.array([stack.resolution_m / 2, stack.resolution_m / 2, 0.0])
-    cells = rotated_cells(points, start, angles, np.zeros(2), stack.resolution_m, 1 << LEVELS)
+    cells = rotated_cells(points, start, angles, np.zeros(2), stack.resolution_m, stack.pad)
+    offsets = cells[:, :, 1] * np.int32(stack.likelihood.shape[2]) + cells[:, :, 0]
     gaps = np.array([settings.separation_m / stack.resolution_m, settings.separation_rad / turn])
-    least = int(settings.score_min * FIELD_MAX * len(points))
-    found, scores = search_peaks(stack.likelihood, stack.free, cells, gaps, least, settings.candidates_max)
+    least = int((settings.score_min * FIELD_MAX - stack.unknown) * len(points))
+    found, scores = search_peaks(stack.likelihood, stack.free, stack.pad, offsets, gaps, least, settings.candidates_max)
     poses = np.column_stack([(found[:, 1:] + 0.5) * stack.resolution_m, angles[found[:, 0]]])
-    return poses, scores / (FIELD_MAX * len(points))
+    return poses, (scores / len(points) + stack.unknown) / FIELD_MAX
 
 
 @kernel
@@ -97,25 +114,37 @@ def keep_peak(peaks, scores, count, gaps, turns, a, x, y, score):  # type: ignor
 
 
 @kernel
-def search_peaks(stack, free, cells, gaps, least, peaks_max):  # type: ignore[no-untyped-def]
+def score_of(field, offsets, shift):  # type: ignore[no-untyped-def]
+    """Sum of a flat field under `offsets` (n,) shifted by `shift`; the field is padded, so that all lie inside."""
+    total = 0
+    for k in range(len(offsets)):
+        total += field[offsets[k] + shift]
+    return total
+
+
+@kernel
+def search_peaks(stack, free, pad, offsets, gaps, least, peaks_max):  # type: ignore[no-untyped-def]
     """Peaks (P, 3) [angle index, x, y] and score sums (P,) over the whole field; see `find_places`.
+
+    `offsets` (A, n) are the points' cells in a flat level of the stack, at each angle, for a robot at cell (0, 0).
 
     Blocks are visited in the order of their bounds; a block whose bound does not exceed the worst peak of a full list
     is dropped, and so is one without free space (Hess et al. 2016, for several maxima).
     """
     levels = len(stack) - 1
-    pad = width = 1 << levels
-    rows, columns = stack.shape[1] - 2 * pad, stack.shape[2] - 2 * pad
+    width, stride = 1 << levels, stack.shape[2]
+    rows, columns = stack.shape[1] - 2 * pad, stride - 2 * pad
+    flat = stack.reshape((len(stack), -1))
     across, along = (columns + width - 1) // width, (rows + width - 1) // width
-    turns = len(cells)
+    turns = len(offsets)
     count = turns * across * along
-    bounds = np.zeros(count, np.int64)
+    bounds = np.full(count, least, np.int64)
     for a in range(turns):
         for by in range(along):
             for bx in range(across):
                 if free[levels, by * width + pad, bx * width + pad] > 0:
-                    bounds[(a * along + by) * across + bx] = block_score(
-                        stack[levels], cells[a], bx * width, by * width
+                    bounds[(a * along + by) * across + bx] = score_of(
+                        flat[levels], offsets[a], (by * stride + bx) * width
                     )
     order = np.argsort(-bounds, kind="mergesort")
     peaks, scores, known = np.zeros((peaks_max, 3), np.int64), np.zeros(peaks_max, np.int64), 0
@@ -144,7 +173,7 @@ def search_peaks(stack, free, cells, gaps, least, peaks_max):  # type: ignore[no
                 qx, qy = x + half * (quarter & 1), y + half * (quarter >> 1)
                 if qx >= columns or qy >= rows or free[level - 1, qy + pad, qx + pad] == 0:
                     continue
-                score = block_score(stack[level - 1], cells[a], qx, qy)
+                score = score_of(flat[level - 1], offsets[a], qy * stride + qx)
                 if score <= threshold:
                     continue
                 insert_block(todo, first, top, qx, qy, level - 1, score)

@@ -22,7 +22,8 @@ class Evidence:
     """Of one scan at the best pose: returns in all, those that agree and those that conflict with the map.
 
     `share` is the weight of the best hypothesis, number `hypothesis`, and `sigma_m` its spread; `margin` is how much
-    worse other places fitted when they were last looked for, in log-odds a return.
+    worse other places fitted when they were last looked for, in log-odds a return, and `rival_agreement` the share of
+    returns that agree at a place which fits like the best of them.
     """
 
     hypothesis: int
@@ -32,6 +33,7 @@ class Evidence:
     agree: int
     conflict: int
     margin: float = math.inf
+    rival_agreement: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +91,9 @@ def _judged(state: HealthState, evidence: Evidence, settings: HealthSettings) ->
     if state.health is Health.OK:
         return Health.OK if certain else Health.AMBIGUOUS
     # Where a map is incomplete, something nearly fits in many places: a new place has to explain the whole scan.
-    if state.agreement < settings.found_above or state.explained < settings.explained_min:
+    least = settings.clear_above if evidence.margin >= settings.clear_margin else settings.found_above
+    if state.agreement < least or state.explained < settings.explained_min:
         return state.health
-    alone = evidence.margin >= settings.rival_margin
+    # Looking along a corridor from either end, nearly all returns agree at both: the lead alone proves nothing yet.
+    alone = evidence.margin >= settings.rival_margin and evidence.rival_agreement < settings.found_above
     return Health.OK if certain and alone and state.updates >= settings.updates_min else Health.AMBIGUOUS

@@ -161,6 +161,7 @@ def update(
     evidence = Evidence(
         hypothesis=found.hypothesis, share=found.share, sigma_m=found.sigma_m, returns=len(scan.points), agree=agree,
         conflict=conflict, margin=state.margin if found.hypothesis == state.favourite else -math.inf,
+        rival_agreement=state.rival_agreement,
     )  # fmt: skip
     health = assess(state.health, evidence, settings.health)
     newly_lost = state.health.health is Health.OK and health.health is not Health.OK

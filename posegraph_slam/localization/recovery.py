@@ -69,10 +69,12 @@ def recover(
 def compare(
     state: FilterState, known: PreparedMap, found: Estimate, places: FloatArray, settings: LocalizationSettings
 ) -> FilterState:
-    """Remember by how much the places fit all remembered scans worse than the estimate does.
+    """Remember how well the best of the places fits all remembered scans, and how much worse than the estimate.
 
-    Places that a match to the map brings to the estimate are not rivals. Where a plan repeats itself the weights of
-    particles say little: they differ by how the map happens to be drawn, and the lighter places soon have none.
+    Scans that follow each other see the same things: a lead over n of them counts by the square root of n, and in full
+    over all that can be remembered. Places that a match to the map brings to the estimate are not rivals. Where a plan
+    repeats itself the weights of particles say little: they differ by how the map happens to be drawn, and the lighter
+    places soon have none.
     """
     compared = evenly(state.recent, SCANS_COMPARED)
     poses, fits, returns = fits_at(
@@ -80,8 +82,12 @@ def compare(
     )
     apart = np.hypot(*(poses[1:, :2] - poses[0, :2]).T) > settings.search.separation_m
     apart |= np.abs(wrap_angle(poses[1:, 2] - poses[0, 2])) > settings.search.separation_rad
-    margin = fits[0] - fits[1:][apart].max(initial=-np.inf)
-    return replace(state, favourite=found.hypothesis, margin=float(margin / max(returns, 1)))
+    fits = fits / max(returns, 1)
+    rival = float(fits[1:][apart].max(initial=-np.inf))
+    agreeing = (rival - CONFLICT_LOG_ODDS) / (AGREE_LOG_ODDS - CONFLICT_LOG_ODDS)
+    weight = math.sqrt(min(len(state.recent) / settings.health.remembered_scans, 1.0))
+    margin = weight * (float(fits[0]) - rival)
+    return replace(state, favourite=found.hypothesis, margin=margin, rival_agreement=agreeing)
 
 
 def evenly(scans: RememberedScans, count: int) -> RememberedScans:

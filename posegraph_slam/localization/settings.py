@@ -87,6 +87,8 @@ class GlobalSearchSettings(Settings):
     """Step of the search in position; the step in heading moves the farthest point by as much."""
     sigma_m: float = Field(default=0.12, gt=0)
     """Width of the map's obstacles in the search."""
+    unknown_likelihood: float = Field(default=0.3, ge=0, le=1)
+    """Likelihood of a return from unknown space in the search, against 1 on an obstacle and 0 in free space."""
     range_max_m: float = Field(default=12.0, gt=0)
     """Returns further away are left out."""
     points_max: int = Field(default=120, ge=20)
@@ -120,6 +122,8 @@ class HealthSettings(Settings):
     """Share of the telling returns that agree, below which the pose is lost."""
     found_above: float = Field(default=0.82, gt=0, lt=1)
     """A new place is believed when this share of the telling returns agrees,"""
+    clear_above: float = Field(default=0.7, gt=0, lt=1)
+    """or this share where it leads every other place clearly: things have moved since the map was drawn,"""
     explained_min: float = Field(default=0.5, ge=0, lt=1)
     """and this share of all returns, those in unknown space included."""
     memory_updates: float = Field(default=10.0, ge=1)
@@ -136,14 +140,18 @@ class HealthSettings(Settings):
     """Updates that a new hypothesis must survive before it is believed,"""
     rival_margin: float = Field(default=0.2, ge=0)
     """and by how much, in log-odds a return, every other place must fit the remembered scans worse; 0.2 is about one
-    conflicting return more in fifteen."""
+    conflicting return more in fifteen. Over a quarter of the scans twice as much is asked for, and a place where
+    `found_above` of the returns agree is a rival however far behind."""
+    clear_margin: float = Field(default=0.5, ge=0)
+    """Log-odds a return, over all remembered scans, by which a place leads clearly."""
     remembered_scans: int = Field(default=96, ge=1)
     """Scans that rivals are compared by, the last ones that weighed the particles."""
 
     @model_validator(mode="after")
     def _check_order(self) -> HealthSettings:
-        if self.lost_below > self.found_above:
-            raise ValueError(f"lost_below {self.lost_below} must not exceed found_above {self.found_above}")
+        if not self.lost_below <= self.clear_above <= self.found_above:
+            shares = f"lost_below {self.lost_below}, clear_above {self.clear_above}, found_above {self.found_above}"
+            raise ValueError(f"{shares} must not fall in this order")
         return self
 
 

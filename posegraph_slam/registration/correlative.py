@@ -46,7 +46,7 @@ def likelihood_field(points, origin, resolution, rows, columns, pad, sigma):  # 
 def max_pooled(field, levels):  # type: ignore[no-untyped-def]
     """Stack (levels + 1, R, C): level h holds the maximum over the block [y, y + 2^h) x [x, x + 2^h)."""
     rows, columns = field.shape
-    stack = np.zeros((levels + 1, rows, columns), np.uint8)
+    stack = np.zeros((levels + 1, rows, columns), field.dtype)
     stack[0] = field
     for h in range(levels):
         step = 1 << h

@@ -138,9 +138,11 @@ def test_a_place_like_the_estimate_is_a_rival_and_others_are_not(world: Any) -> 
     near = here + np.array([0.1, 0.1, 0.03])
     alone = compare(state, known, found, np.concatenate([elsewhere, near[None]]), SETTINGS)
     assert alone.margin > 2 * SETTINGS.health.rival_margin
+    assert alone.rival_agreement < 0.7
     rivalled = compare(state, known, found, np.concatenate([elsewhere, other_hall[None]]), SETTINGS)
     assert abs(rivalled.margin) < 0.02
     assert rivalled.favourite == found.hypothesis
+    assert rivalled.rival_agreement > SETTINGS.health.found_above
 
 
 def test_same_seed_same_bytes_other_seed_other_bytes(world: Any, tracked: Tracked) -> None:
@@ -246,7 +248,11 @@ def test_health_follows_the_evidence() -> None:
     assert judged(fresh, 50, margin=0.1).health is Health.AMBIGUOUS  # somewhere else fits nearly as well
     assert judged(known, 50, margin=0.1).health is Health.OK  # which does not end a track
     assert judged(fresh, 50, agree=25, conflict=3).health is not Health.OK  # most of the scan is unexplained
-    assert judged(fresh, 50, agree=45, conflict=15).health is not Health.OK  # enough to keep a track, not to begin one
+    assert judged(fresh, 50, agree=40, conflict=20).health is not Health.OK  # enough to keep a track, not to begin one
+    assert judged(fresh, 50, agree=45, conflict=15).health is Health.OK  # but where it leads all others by far
+    assert judged(fresh, 50, agree=45, conflict=15, margin=0.4).health is not Health.OK
+    assert judged(fresh, 50, margin=0.3, rival_agreement=0.7).health is Health.OK
+    assert judged(fresh, 50, margin=0.3, rival_agreement=0.85).health is Health.AMBIGUOUS  # two places to believe
     assert judged(known, 50, agree=45, conflict=15).health is Health.OK
 
 
