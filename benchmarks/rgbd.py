@@ -40,8 +40,8 @@ FIVE_FRAMES = {"fx_px": 518.0, "fy_px": 519.0, "cx_px": 325.5, "cy_px": 253.5}
 ROOM_FRAMES, ROOM_TURNS = 120, 1.1
 BEND = 0.003
 """Error of inverse depth (1/m) at the borders of a bent depth image: one unit of disparity."""
-ESTIMATED = {"inverse_depth_sigma": 0.002}
-"""What the rows "depth's error estimated" set for all alignments."""
+TRUSTED = {"inverse_depth_sigma": 0.0}
+"""What the rows "depth trusted" set for all alignments."""
 SPEED_FRAMES = 40
 """Frames on which the speed of odometry is measured."""
 
@@ -115,11 +115,11 @@ def first_to_last(frames: PreparedFrames, poses: FloatArray, guess: FloatArray) 
     }
 
 
-def estimating(configuration: Configuration) -> Configuration:
-    """Return the configuration with the smooth error of depth estimated in every alignment."""
+def trusting(configuration: Configuration) -> Configuration:
+    """Return the configuration with depth trusted in every alignment: its smooth error is not estimated."""
     rgbd = configuration.rgbd
-    odometry = rgbd.odometry.model_copy(update={"alignment": rgbd.odometry.alignment.model_copy(update=ESTIMATED)})
-    loops = rgbd.loops.model_copy(update={"alignment": rgbd.loops.alignment.model_copy(update=ESTIMATED)})
+    odometry = rgbd.odometry.model_copy(update={"alignment": rgbd.odometry.alignment.model_copy(update=TRUSTED)})
+    loops = rgbd.loops.model_copy(update={"alignment": rgbd.loops.alignment.model_copy(update=TRUSTED)})
     return configuration.model_copy(update={"rgbd": rgbd.model_copy(update={"odometry": odometry, "loops": loops})})
 
 
@@ -139,7 +139,7 @@ def measure(log: RobotLog, configuration: Configuration, o3d: Any) -> dict[str, 
     result = optimize_rgbd(log, configuration)
     optimised = result.trajectory.poses
     paths = {"odometry": result.stages["odometry"].poses, "optimised": optimised}
-    paths["optimised, depth's error estimated"] = optimize_rgbd(log, estimating(configuration)).trajectory.poses
+    paths["optimised, depth trusted"] = optimize_rgbd(log, trusting(configuration)).trajectory.poses
     rates = {"odometry": len(stamps) / seconds}
     if o3d is not None:
         paths["Open3D odometry"], seconds = timed(lambda: open3d_path(o3d, sequence))

@@ -16,12 +16,18 @@ from pydantic import Field
 from posegraph_slam.arrays import FloatArray, read_only
 from posegraph_slam.registration.result import RegistrationStatus
 from posegraph_slam.registration.rgbd_frame import ReferencePoints, RgbdFrame, RgbdReference
-from posegraph_slam.registration.rgbd_kernels import adjoint, align_level, describe_fit, inverse, source_update
+from posegraph_slam.registration.rgbd_kernels import (
+    TILES,
+    adjoint,
+    align_level,
+    describe_fit,
+    inverse,
+    offset_sigma,
+    source_update,
+)
 from posegraph_slam.registration.rgbd_warp import Side
 from posegraph_slam.settings import Settings
 
-TILES = 8
-"""The image is cut into 8 x 8 tiles; what they say of the motion is taken for independent."""
 LEAST_POINTS = 100
 
 
@@ -38,9 +44,13 @@ class RgbdAlignmentSettings(Settings):
     """Depth is never taken to be better than this share of the sensor's deviation,"""
     least_brightness_sigma: float = Field(default=2.0, gt=0)
     """nor brightness than this, of 255."""
-    inverse_depth_sigma: float = Field(default=0.0, ge=0)
-    """Deviation (1/m) of a smooth error of inverse depth between two frames, which is then estimated with the motion;
-    0 trusts the sensor's calibration. 0.002 is the noise of one pixel of a structured-light sensor."""
+    image_noise: float = Field(default=1.0, gt=0)
+    """Noise of brightness, of 255, where depth is exact. Brightness that the uncertainty of depth changes by more, as
+    it does where the camera moved across an edge, counts for less; a large value lets all count alike."""
+    inverse_depth_sigma: float = Field(default=0.0015, ge=0)
+    """Deviation (1/m) of the sensor's smooth error of inverse depth between two views half an image's width apart; it
+    is less for closer views, and estimated with the motion. 0 trusts the sensor's calibration. A structured-light
+    sensor tells disparities in steps of 0.003."""
     overlap_min: float = Field(default=0.2, ge=0, le=1)
     """Least share of the points that the other frame sees, the larger of both directions."""
     agreement_min: float = Field(default=0.8, ge=0, le=1)
@@ -55,7 +65,7 @@ class RgbdAlignmentSettings(Settings):
     """No alignment is better known than this,"""
     sigma_floor_rad: float = Field(default=0.0005, gt=0)
     """nor than this: calibration and exposure time err alike in all pixels,"""
-    sigma_share: float = Field(default=0.01, ge=0)
+    sigma_share: float = Field(default=0.005, ge=0)
     """nor than this share of the motion itself."""
 
 
@@ -121,8 +131,9 @@ def align_frames(
 
 
 def _floors(settings: RgbdAlignmentSettings) -> FloatArray:
-    """Deviations (3,) that the kernels take: the least ones of depth and of brightness, and that of the offsets."""
-    return np.array([settings.least_depth_sigma, settings.least_brightness_sigma, settings.inverse_depth_sigma])
+    """Deviations (4,) that the kernels take: the least ones of depth and brightness, of the offsets, and of noise."""
+    s = settings
+    return np.array([s.least_depth_sigma, s.least_brightness_sigma, s.inverse_depth_sigma, s.image_noise])
 
 
 def _side(reference: RgbdReference, frame: RgbdFrame, level: int) -> Side:
@@ -147,12 +158,12 @@ def _described(
 ) -> RgbdAlignment:  # fmt: skip
     """Measure the fit at T on one level and judge it."""
     floors, gate = _floors(settings), settings.gate_m
-    H, M, measures = describe_fit(_side(target, frame, level), T, False, offsets, gate, floors, TILES)
+    H, M, measures = describe_fit(_side(target, frame, level), T, False, offsets, gate, floors)
     all_measures = [measures]
     if back is not None:
         T_back = inverse(T)
         other = _side(back, target.frame, level)
-        H_back, M_back, measures = describe_fit(other, T_back, True, offsets, gate, floors, TILES)
+        H_back, M_back, measures = describe_fit(other, T_back, True, offsets, gate, floors)
         A = source_update(T_back, len(H))
         H, M = H + A.T @ H_back @ A, 2 * (M + A.T @ M_back @ A)  # both directions see the same surfaces
         all_measures.append(measures)
@@ -161,7 +172,8 @@ def _described(
     A[:6, :6] = adjoint(T)
     m = np.array(all_measures)
     total = m.sum(axis=0)
-    information, weakest_m = _information(A.T @ H @ A, A.T @ M @ A, T, float(total[6]), settings)
+    sigma = offset_sigma(_side(target, frame, level), T, settings.inverse_depth_sigma) if len(H) > 6 else 0.0
+    information, weakest_m = _information(A.T @ H @ A, A.T @ M @ A, T, float(total[6]), sigma, settings)
     in_view = (m[:, 2:6].sum(axis=1)) / np.maximum(m[:, 0], 1)
     overlap = float(in_view.max())
     agreement = float(total[3] / max(total[3] + total[5], 1))
@@ -188,27 +200,28 @@ def _described(
 
 
 def _information(
-    H: FloatArray, M: FloatArray, T: FloatArray, points: float, settings: RgbdAlignmentSettings
+    H: FloatArray, M: FloatArray, T: FloatArray, points: float, sigma: float, settings: RgbdAlignmentSettings
 ) -> tuple[FloatArray, float]:
     """Information (6, 6) and the deviation (m) of the weakest direction, turns counted at one metre.
 
     The covariance is H^-1 M H^-1 (Huber 1967) with M summed over tiles (Liang and Zeger 1986), plus floors; that of the
-    offsets of depth is part of it. Residuals that vanish, on a blank wall, would make it small where nothing is known:
-    the weakest direction is judged by H too, with each tile as one measurement.
+    offsets of depth, known to `sigma` beforehand, is part of it. Residuals that vanish, on a blank wall, would make it
+    small where nothing is known: the weakest direction is judged by H too, with each tile as one measurement.
     """
     scale = float(np.trace(H[:6, :6])) / 6
     if not (np.isfinite(H).all() and np.isfinite(M).all() and scale > 0):
         return np.eye(6) * 1e-6, np.inf
     ridge, prior = np.full(len(H), 1e-9 * scale), np.zeros(len(H))
-    prior[6:] = settings.inverse_depth_sigma**-2.0 if len(H) > 6 else 0.0
-    inverse_H = np.linalg.inv(H + np.diag(ridge + prior))
-    covariance = (inverse_H @ (M + np.diag(prior)) @ inverse_H)[:6, :6]
+    prior[6:] = sigma**-2.0 if len(H) > 6 else 0.0
+    a_tile = max(points / TILES**2, 1.0)  # the prior counts as much as a tile, in the alignment too
+    inverse_H = np.linalg.inv(H + np.diag(ridge + a_tile * prior))
+    covariance = (inverse_H @ (M + np.diag(a_tile**2 * prior)) @ inverse_H)[:6, :6]
     cosine = np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)
     turn, shift = float(np.arccos(cosine)), float(np.linalg.norm(T[:3, 3]))
     floor = np.repeat([settings.sigma_floor_rad + settings.sigma_share * turn,
                        settings.sigma_floor_m + settings.sigma_share * shift], 3) ** 2  # fmt: skip
     covariance = 0.5 * (covariance + covariance.T) + np.diag(floor)
-    known = np.linalg.inv((H + np.diag(ridge)) / max(points / TILES**2, 1.0) + np.diag(prior))[:6, :6]
+    known = np.linalg.inv((H + np.diag(ridge)) / a_tile + np.diag(prior))[:6, :6]
     weakest = float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], np.linalg.eigvalsh(0.5 * (known + known.T))[-1])))
     information = np.linalg.inv(covariance)
     return 0.5 * (information + information.T), weakest

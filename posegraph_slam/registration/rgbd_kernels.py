@@ -6,10 +6,12 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.jit import kernel
-from posegraph_slam.registration.rgbd_warp import Side, warp
+from posegraph_slam.registration.rgbd_warp import Side, view_shift, warp
 
 POSE = 6
 """Unknowns of the pose; three more where offsets of inverse depth are estimated too, see `warp`."""
+TILES = 8
+"""The image is cut into 8 x 8 tiles; what they say of the motion is taken for independent."""
 MEDIAN_TO_SIGMA = 1.4826
 CAUCHY, CUT = 2.3849, 14.0
 """Scale of the weights in deviations, and where a residual counts no more. On wide pairs Tukey's weights, which end at
@@ -33,12 +35,13 @@ def middle_of(values: FloatArray, about: float, absolute: bool) -> float:
 @kernel
 def normal_equations(
     points: FloatArray, normals: FloatArray, gradients: FloatArray, across: FloatArray, brightness: FloatArray,
-    moved: FloatArray, sigma: FloatArray, levers: FloatArray, scales: FloatArray, H: FloatArray, g: FloatArray,
+    spread: FloatArray, moved: FloatArray, sigma: FloatArray, levers: FloatArray, scales: FloatArray, H: FloatArray,
+    g: FloatArray,
 ) -> float:  # fmt: skip
     """Add up H (m, m) and g (m,), m = 6 for the update exp(e) T, 9 with the offsets of depth, under Cauchy's weights.
 
-    `levers` (n, 3) is what the offsets add to `across`, `scales` [deviation of `across`, deviation of `brightness`, its
-    offset]. Returns the weighted cost.
+    `levers` (n, 3) is what the offsets add to `across`, `scales` [deviation of `across`, that of `brightness` where its
+    `spread` (n,) is 1, its offset]. Returns the weighted cost.
     """
     H[:], g[:] = 0.0, 0.0
     size = len(g)
@@ -63,10 +66,11 @@ def normal_equations(
                     for b in range(a + 1):
                         H[a, b] += weight * row[a] * row[b]
         if brightness[k] == brightness[k]:
-            e = (brightness[k] - scales[2]) / scales[1]
+            deviation = scales[1] * spread[k]
+            e = (brightness[k] - scales[2]) / deviation
             if abs(e) < CUT:
                 weight = 1.0 / (1.0 + (e / CAUCHY) ** 2)
-                factor = -1.0 / scales[1]
+                factor = -1.0 / deviation
                 hx, hy, hz = gradients[k, 0] * factor, gradients[k, 1] * factor, gradients[k, 2] * factor
                 row[0] = points[k, 1] * hz - points[k, 2] * hy
                 row[1] = points[k, 2] * hx - points[k, 0] * hz
@@ -134,12 +138,12 @@ def linearise(
 ) -> None:  # fmt: skip
     """Write H (m, m) and g (m,) of one frame's points against the other frame, each kind of residual on its scale."""
     n = len(side.points)
-    across, brightness, moved, state = np.empty(n), np.empty(n), np.zeros((n, 3)), np.zeros(n, np.uint8)
-    levers = np.zeros((n, 3))
-    warp(side, T, back, offsets, gate, across, brightness, moved, levers, state)
-    scales = residual_scales(across, brightness, floors)
+    across, brightness, spread, state = np.empty(n), np.empty(n), np.empty(n), np.zeros(n, np.uint8)
+    moved, levers = np.zeros((n, 3)), np.zeros((n, 3))
+    warp(side, T, back, offsets, gate, floors[3], across, brightness, spread, moved, levers, state)
+    scales = residual_scales(across, brightness, spread, floors)
     normal_equations(
-        side.points, side.normals, side.gradients, across, brightness, moved, side.sigma, levers, scales, H, g
+        side.points, side.normals, side.gradients, across, brightness, spread, moved, side.sigma, levers, scales, H, g
     )
 
 
@@ -155,13 +159,23 @@ def source_update(T_source_target: FloatArray, size: int) -> FloatArray:
 
 
 @kernel
-def residual_scales(across: FloatArray, brightness: FloatArray, floors: FloatArray) -> FloatArray:
-    """Robust deviation of `across`, that of `brightness`, and the offset of the latter: exposures differ."""
+def residual_scales(across: FloatArray, brightness: FloatArray, spread: FloatArray, floors: FloatArray) -> FloatArray:
+    """Robust deviation of `across`, that of `brightness` over its `spread`, and its offset: exposures differ."""
     scales = np.empty(3)
     scales[0] = max(MEDIAN_TO_SIGMA * middle_of(across, 0.0, True), floors[0])
     scales[2] = middle_of(brightness, 0.0, False)
-    scales[1] = max(MEDIAN_TO_SIGMA * middle_of(brightness, scales[2], True), floors[1])
+    scales[1] = max(MEDIAN_TO_SIGMA * middle_of((brightness - scales[2]) / spread, 0.0, True), floors[1])
     return scales
+
+
+@kernel
+def offset_sigma(side: Side, T: FloatArray, sigma: float) -> float:
+    """Deviation of the offsets of inverse depth between two views: `sigma` for views half an image's width apart.
+
+    The error belongs to the sensor and lies still in its image (Teichman et al. 2013): of the same view it is the same
+    in both frames and cancels, and what is left of a smooth one grows with the shift of the view.
+    """
+    return sigma * max(view_shift(side, T), 1e-3)
 
 
 @kernel
@@ -171,14 +185,20 @@ def align_level(
     """Iterate Gauss-Newton on one level from T; stop when a step moves the view less than a fiftieth of a pixel.
 
     `side` holds the target's points and the source's images, `back` the source's points, none of them to align in one
-    direction, and the target's images. `offsets` (3,) of inverse depth go in and come out. `floors` are the least
-    deviations [of depth in its own deviations, of brightness] and the deviation of the offsets, 0 to keep them as they
-    are. Returns the pose, iterations made, and whether they settled.
+    direction, and the target's images. `offsets` (3,) of inverse depth go in and come out. `floors` (4,) are the least
+    deviations [of depth in its own deviations, of brightness], the deviation of the offsets as `offset_sigma` takes it,
+    0 to keep them as they are, and the noise of brightness. What is known of the offsets beforehand counts as much as a
+    tile of the image: its points are no independent measurements of a smooth error. Returns the pose, iterations made,
+    and whether they settled.
     """
     size = POSE + 3 if floors[2] > 0 else POSE
     H, g, H_back, g_back = np.zeros((size, size)), np.zeros(size), np.zeros((size, size)), np.zeros(size)
     distance = max(side.points[:, 2].mean(), 0.1)
     fine = 0.02 / side.camera[0]
+    prior = 0.0
+    if size > POSE:
+        points_a_tile = max((len(side.points) + len(back.points)) / TILES**2, 1.0)
+        prior = points_a_tile * offset_sigma(side, T, floors[2]) ** -2.0
     for made in range(iterations):
         linearise(side, T, False, offsets, gate, floors, H, g)
         if len(back.points) > 0:
@@ -188,8 +208,8 @@ def align_level(
             H += A.T @ H_back @ A
             g += A.T @ g_back
         for a in range(POSE, size):
-            H[a, a] += floors[2] ** -2.0
-            g[a] += floors[2] ** -2.0 * offsets[a - POSE]
+            H[a, a] += prior
+            g[a] += prior * offsets[a - POSE]
         for a in range(size):
             H[a, a] += 1e-6 * H[a, a] + 1e-9
         step = np.asarray(-np.linalg.solve(H, g))
@@ -206,7 +226,7 @@ def align_level(
 
 @kernel
 def describe_fit(
-    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, floors: FloatArray, tiles: int
+    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, floors: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return H (m, m), the sum of outer products of the scores of image tiles (m, m), and measures of the fit (10,).
 
@@ -218,13 +238,13 @@ def describe_fit(
         side.points, side.normals, side.gradients, side.intensity, side.sigma,
     )  # fmt: skip
     camera, image, n = side.camera, side.image, len(side.points)
-    across, brightness, moved, state = np.empty(n), np.empty(n), np.zeros((n, 3)), np.zeros(n, np.uint8)
-    levers = np.zeros((n, 3))
-    warp(side, T, back, offsets, gate, across, brightness, moved, levers, state)
-    scales = residual_scales(across, brightness, floors)
+    across, brightness, spread, state = np.empty(n), np.empty(n), np.empty(n), np.zeros(n, np.uint8)
+    moved, levers = np.zeros((n, 3)), np.zeros((n, 3))
+    warp(side, T, back, offsets, gate, floors[3], across, brightness, spread, moved, levers, state)
+    scales = residual_scales(across, brightness, spread, floors)
     size = POSE + 3 if floors[2] > 0 else POSE
     H, g = np.zeros((size, size)), np.zeros(size)
-    normal_equations(points, normals, gradients, across, brightness, moved, sigma, levers, scales, H, g)
+    normal_equations(points, normals, gradients, across, brightness, spread, moved, sigma, levers, scales, H, g)
     measures = np.zeros(10)
     measures[0] = n
     pairs, sum_a, sum_b, sum_aa, sum_bb, sum_ab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -232,8 +252,8 @@ def describe_fit(
     for k in range(n):
         u = camera[0] * points[k, 0] / points[k, 2] + camera[2]
         v = camera[1] * points[k, 1] / points[k, 2] + camera[3]
-        column = min(max(int(u * tiles / image.shape[1]), 0), tiles - 1)
-        tile[k] = min(max(int(v * tiles / image.shape[0]), 0), tiles - 1) * tiles + column
+        column = min(max(int(u * TILES / image.shape[1]), 0), TILES - 1)
+        tile[k] = min(max(int(v * TILES / image.shape[0]), 0), TILES - 1) * TILES + column
         measures[1 + state[k]] += 1
         if across[k] == across[k]:
             measures[6] += 1
@@ -246,8 +266,8 @@ def describe_fit(
             sum_a, sum_b = sum_a + a, sum_b + b
             sum_aa, sum_bb, sum_ab = sum_aa + a * a, sum_bb + b * b, sum_ab + a * b
     if pairs > 1:
-        spread = (sum_aa - sum_a * sum_a / pairs) * (sum_bb - sum_b * sum_b / pairs)
-        measures[9] = (sum_ab - sum_a * sum_b / pairs) / np.sqrt(spread) if spread > 0 else 0.0
+        product = (sum_aa - sum_a * sum_a / pairs) * (sum_bb - sum_b * sum_b / pairs)
+        measures[9] = (sum_ab - sum_a * sum_b / pairs) / np.sqrt(product) if product > 0 else 0.0
     order = np.argsort(tile, kind="mergesort")
     M, H_tile, g_tile = np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
     start = 0
@@ -256,8 +276,8 @@ def describe_fit(
         while end < n and tile[order[end]] == tile[order[start]]:
             end += 1
         rows = order[start:end]
-        normal_equations(points[rows], normals[rows], gradients[rows], across[rows], brightness[rows], moved[rows],
-                         sigma[rows], levers[rows], scales, H_tile, g_tile)  # fmt: skip
+        normal_equations(points[rows], normals[rows], gradients[rows], across[rows], brightness[rows], spread[rows],
+                         moved[rows], sigma[rows], levers[rows], scales, H_tile, g_tile)  # fmt: skip
         for a in range(size):
             for b in range(size):
                 M[a, b] += g_tile[a] * g_tile[b]

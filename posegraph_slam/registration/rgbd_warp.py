@@ -13,6 +13,9 @@ OUT, UNMEASURED, SEEN, OCCLUDED, INVADES = 0, 1, 2, 3, 4
 """What becomes of a reference point in the source frame: not in view, in view without depth, seen on its surface,
 hidden behind something nearer, or in space that the source saw free."""
 
+SHIFT_STRIDE = 7
+"""Every so many points tell how far the views are apart."""
+
 
 class Side(NamedTuple):
     """Points of one frame (see `ReferencePoints`) and the images of the other, [fx, fy, cx, cy] its camera."""
@@ -29,8 +32,8 @@ class Side(NamedTuple):
 
 @kernel
 def warp(
-    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, across: FloatArray, brightness: FloatArray,
-    moved: FloatArray, levers: FloatArray, state: ByteArray,
+    side: Side, T: FloatArray, back: bool, offsets: FloatArray, gate: float, noise: float, across: FloatArray,
+    brightness: FloatArray, spread: FloatArray, moved: FloatArray, levers: FloatArray, state: ByteArray,
 ) -> None:  # fmt: skip
     """Compare reference points with the source frame at T = T_target_source.
 
@@ -42,7 +45,9 @@ def warp(
     Writes for every point its distance `across` (n,) of the source's surface from the plane of the reference, in
     deviations of depth (NaN where unknown) with its derivatives `levers` (n, 3) by the offsets, the difference of
     `brightness` (n,) (NaN where unknown), the surface point `moved` (n, 3) in the target frame, and its `state` (n,).
-    Depths further apart than the larger of `gate` and six deviations are no match.
+    Depths further apart than the larger of `gate` and six deviations are no match. `spread` (n,) is the deviation of
+    the brightness over `noise`, that of an exact depth: an error of depth shifts the point along its epipolar line, and
+    changes its brightness by the slope there (Engel et al. 2014, eq. 13).
     """
     points, normals, gradients, intensity, sigma = (
         side.points, side.normals, side.gradients, side.intensity, side.sigma,
@@ -51,7 +56,7 @@ def warp(
     fx, fy, cx, cy = side.camera[0], side.camera[1], side.camera[2], side.camera[3]
     height, width = image.shape
     for k in range(len(points)):
-        across[k], brightness[k], state[k] = np.nan, np.nan, OUT
+        across[k], brightness[k], spread[k], state[k] = np.nan, np.nan, 1.0, OUT
         dx, dy, dz = points[k, 0] - T[0, 3], points[k, 1] - T[1, 3], points[k, 2] - T[2, 3]
         x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
         y = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
@@ -106,3 +111,28 @@ def warp(
                 (1 - a) * image[i + 1, j] + a * image[i + 1, j + 1]
             )
             brightness[k] = value - intensity[k]
+            slope = 0.0
+            for r in range(3):  # a point that moves along its ray is seen to move as the other camera does
+                slope += gradients[k, r] * T[r, 3]
+            spread[k] = np.sqrt(1.0 + (slope / points[k, 2] * sigma[k] / noise) ** 2)
+
+
+@kernel
+def view_shift(side: Side, T: FloatArray) -> float:
+    """Shift of the points from one image to the other at T, root mean square, as a share of half the image's width."""
+    fx, fy, cx, cy = side.camera[0], side.camera[1], side.camera[2], side.camera[3]
+    height, width = side.image.shape
+    total, count = 0.0, 0
+    for k in range(0, len(side.points), SHIFT_STRIDE):
+        px, py, pz = side.points[k, 0], side.points[k, 1], side.points[k, 2]
+        dx, dy, dz = px - T[0, 3], py - T[1, 3], pz - T[2, 3]
+        x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
+        y = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
+        z = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
+        if z < 0.05:
+            continue
+        du, dv = fx * x / z, fy * y / z
+        if 0.0 <= du + cx < width and 0.0 <= dv + cy < height:
+            total += (du - fx * px / pz) ** 2 + (dv - fy * py / pz) ** 2
+            count += 1
+    return float(np.sqrt(total / max(count, 1)) / (0.5 * width))

@@ -123,28 +123,21 @@ def test_an_image_that_breaks_after_reading_is_named(log: Path, tmp_path: Path) 
 
 @pytest.mark.data
 def test_five_frames_far_apart_are_placed(psg_data: Path) -> None:
-    """Their poses.txt misses the matches of its own images by up to 9 pixels: it is no better than a degree."""
+    """Relative poses within 0.03 m and 1 degree of pose.txt, which itself misses the images by up to 9 pixels."""
     robot_log = read(psg_data / "rgbd/five_frames")
     result = optimize_rgbd(robot_log, load_configuration(["default"], [*FIVE_FRAMES, "maps=false"]))
     assert robot_log.truth is not None
-    truth, poses = robot_log.truth.poses, result.trajectory.poses
+    truth = robot_log.truth.poses
     assert result.odometry.tracked.all()
-    steps = SE3.inverse(SE3.between(truth[:-1], truth[1:])) @ SE3.between(poses[:-1], poses[1:])
-    assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.03
-    assert np.rad2deg(Rotation.from_matrix(steps[:, :3, :3]).magnitude()).max() < 1.1
+    for poses in (stage.poses for stage in result.stages.values()):
+        steps = SE3.inverse(SE3.between(truth[:-1], truth[1:])) @ SE3.between(poses[:-1], poses[1:])
+        assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.03
+        assert np.rad2deg(Rotation.from_matrix(steps[:, :3, :3]).magnitude()).max() < 1.0
+        from_first = SE3.inverse(SE3.between(truth[:1], truth)) @ SE3.between(poses[:1], poses)
+        assert np.rad2deg(Rotation.from_matrix(from_first[:, :3, :3]).magnitude()).max() < 1.0
+        assert np.linalg.norm(from_first[:, :3, 3], axis=1).max() < 0.05
     assert result.comparison.rows[0].name == "APE position RMSE"
     assert result.comparison.rows[0].values[-1] < 0.02
-
-
-@pytest.mark.data
-def test_estimating_the_bend_of_depth_turns_five_frames_right(psg_data: Path) -> None:
-    robot_log = read(psg_data / "rgbd/five_frames")
-    asked = [f"rgbd.{part}.alignment.inverse_depth_sigma=0.002" for part in ("odometry", "loops")]
-    result = optimize_rgbd(robot_log, load_configuration(["default"], [*FIVE_FRAMES, *asked, "maps=false"]))
-    assert robot_log.truth is not None
-    relative = [SE3.between(poses[:1], poses) for poses in (robot_log.truth.poses, result.trajectory.poses)]
-    turns = Rotation.from_matrix((SE3.inverse(relative[0]) @ relative[1])[:, :3, :3]).magnitude()
-    assert np.rad2deg(turns).max() < 1.0
 
 
 @pytest.mark.data

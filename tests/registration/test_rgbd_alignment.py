@@ -21,9 +21,10 @@ from posegraph_slam.registration.result import RegistrationStatus
 from posegraph_slam.registration.rgbd_alignment import RgbdAlignmentSettings, align_frames
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, prepare_frame, prepare_reference
 from posegraph_slam.registration.rgbd_kernels import align_level, left_update, linearise
-from posegraph_slam.registration.rgbd_warp import Side, warp
+from posegraph_slam.registration.rgbd_warp import Side, view_shift, warp
 
 CAMERA = small_camera(160, 120)
+LARGE = small_camera(320, 240)
 SETTINGS = RgbdAlignmentSettings()
 POSES = loop_through_room(120)
 
@@ -139,7 +140,7 @@ def test_the_gradient_vanishes_at_the_truth_and_points_back_beside_it() -> None:
     p, truth = target.points[0], SE3.between(POSES[3], POSES[4])
     side = Side(p.points, p.normals, p.gradients, p.intensity, p.sigma_m,
                 source.intensity[0], source.depth[0], source.camera[0])  # fmt: skip
-    floors, offsets, H, g = np.array([0.3, 2.0, 0.0]), np.zeros(3), np.zeros((6, 6)), np.zeros(6)
+    floors, offsets, H, g = np.array([0.3, 2.0, 0.0, 1.0]), np.zeros(3), np.zeros((6, 6)), np.zeros(6)
     rng = np.random.default_rng(0)
     for _ in range(5):
         off = rng.normal(0, 1, 6) * np.array([2e-3] * 3 + [4e-3] * 3)
@@ -153,18 +154,18 @@ def test_the_gradient_vanishes_at_the_truth_and_points_back_beside_it() -> None:
     assert error(T, truth)[0] < 2e-3
 
 
-def test_a_sensor_that_bends_surfaces_is_seen_through_where_that_is_asked_for() -> None:
+def test_a_sensor_that_bends_surfaces_is_seen_through_unless_it_is_trusted() -> None:
     # two units of disparity of a structured-light sensor at either border, of opposite sign
-    asked = SETTINGS.model_copy(update={"inverse_depth_sigma": 0.002})
+    trust = SETTINGS.model_copy(update={"inverse_depth_sigma": 0.0})
     plain, bent = [], []
     for k in range(0, 100, 20):
         a, b = (prepare_reference(view(POSES[m], noise=1, seed=m, bend=0.006)) for m in (k, k + 4))
         truth = SE3.between(POSES[k], POSES[k + 4])
-        trusting, found = align_frames(a, b, truth, SETTINGS), align_frames(a, b, truth, asked)
+        trusting, found = align_frames(a, b, truth, trust), align_frames(a, b, truth, SETTINGS)
         np.testing.assert_array_equal(trusting.inverse_depth_offsets, 0)
         plain.append(error(trusting.T_target_source, truth))
         bent.append(error(found.T_target_source, truth))
-        swapped = align_frames(b, a, SE3.inverse(truth), asked)
+        swapped = align_frames(b, a, SE3.inverse(truth), SETTINGS)
         shift, turn = error(found.T_target_source, SE3.inverse(swapped.T_target_source))
         assert shift < 0.004
         assert turn < 0.1
@@ -173,19 +174,87 @@ def test_a_sensor_that_bends_surfaces_is_seen_through_where_that_is_asked_for() 
     assert np.mean(bent, axis=0)[1] < np.mean(plain, axis=0)[1]
 
 
-def test_the_error_of_depth_between_two_frames_is_found() -> None:
-    # the second frame measures everything 0.01 / m too near; its pose is the first one's, so that nothing hides it
-    asked = SETTINGS.model_copy(update={"inverse_depth_sigma": 0.01})
-    a, b = view(POSES[5]), view(POSES[5])
-    nearer = tuple(np.where(d > 0, 1 / (1 / np.maximum(d, 0.1) + 0.01), 0).astype(np.float32) for d in b.depth)
-    b = RgbdFrame(intensity=b.intensity, depth=nearer, camera=b.camera)
+def nearer(frame: RgbdFrame, offset: float) -> RgbdFrame:
+    """The frame with all inverse depths larger by an offset (1/m)."""
+    depth = tuple(np.where(d > 0, 1 / (1 / np.maximum(d, 0.1) + offset), 0).astype(np.float32) for d in frame.depth)
+    return RgbdFrame(intensity=frame.intensity, depth=depth, camera=frame.camera)
+
+
+def test_the_error_of_depth_between_two_views_is_found() -> None:
+    asked, trust = (SETTINGS.model_copy(update={"inverse_depth_sigma": sigma}) for sigma in (0.03, 0.0))
+    a, b, truth = view(POSES[5]), nearer(view(POSES[9]), 0.01), SE3.between(POSES[5], POSES[9])
     for source in (b, prepare_reference(b)):
-        found = align_frames(prepare_reference(a), source, np.eye(4), asked)
+        found = align_frames(prepare_reference(a), source, truth, asked)
         assert found.usable
-        np.testing.assert_allclose(found.inverse_depth_offsets, [0.01, 0, 0], atol=1e-3)
-        assert error(found.T_target_source, np.eye(4))[0] < 2e-3
-    back = align_frames(prepare_reference(b), prepare_reference(a), np.eye(4), asked)
-    np.testing.assert_allclose(back.inverse_depth_offsets, [-0.01, 0, 0], atol=1e-3)
+        np.testing.assert_allclose(found.inverse_depth_offsets, [0.01, 0, 0], atol=2e-3)
+        misled = align_frames(prepare_reference(a), source, truth, trust)
+        assert error(found.T_target_source, truth)[0] < 0.25 * error(misled.T_target_source, truth)[0]
+    back = align_frames(prepare_reference(b), prepare_reference(a), SE3.inverse(truth), asked)
+    np.testing.assert_allclose(back.inverse_depth_offsets, [-0.01, 0, 0], atol=2e-3)
+
+
+def test_a_sensor_errs_alike_in_two_frames_of_one_view() -> None:
+    a, b = prepare_reference(view(POSES[5])), prepare_reference(nearer(view(POSES[5]), 0.003))
+    found = align_frames(a, b, np.eye(4), SETTINGS)
+    assert np.abs(found.inverse_depth_offsets).max() < 1e-4
+    apart = prepare_reference(nearer(view(POSES[9]), 0.003))
+    found = align_frames(a, apart, SE3.between(POSES[5], POSES[9]), SETTINGS)
+    assert found.inverse_depth_offsets[0] > 1e-3
+
+
+def side_of(target: FloatArray, source: FloatArray) -> Side:
+    """Points of the view from one pose against the images from another."""
+    p, frame = prepare_reference(view(target, camera=LARGE)).points[0], view(source, camera=LARGE)
+    return Side(p.points, p.normals, p.gradients, p.intensity, p.sigma_m,
+                frame.intensity[0], frame.depth[0], frame.camera[0])  # fmt: skip
+
+
+def compared(side: Side, T: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:
+    """Differences of brightness at T, and their deviations as multiples of the noise."""
+    n = len(side.points)
+    brightness, spread, none = np.empty(n), np.empty(n), np.zeros((n, 3))
+    warp(side, T, False, np.zeros(3), 0.06, noise, np.empty(n), brightness, spread, none.copy(), none.copy(),
+         np.zeros(n, np.uint8))  # fmt: skip
+    return brightness, spread
+
+
+def test_brightness_is_as_uncertain_as_the_depth_under_it() -> None:
+    truth = SE3.between(POSES[3], POSES[6])
+    side = side_of(POSES[3], POSES[6])
+    brightness, spread = compared(side, truth, 1.0)
+    further = side._replace(points=side.points * (1 + side.sigma / side.points[:, 2])[:, None])
+    change = np.abs(compared(further, truth, 1.0)[0] - brightness)
+    stated = np.sqrt(spread**2 - 1)
+    known = np.isfinite(change) & (stated > 0.2)
+    assert known.sum() > 500
+    assert 0.8 < np.median(change[known] / stated[known]) < 1.25
+    assert np.corrcoef(change[known], stated[known])[0, 1] > 0.7
+    # without parallax the depth does not matter
+    np.testing.assert_array_equal(compared(side, np.eye(4), 1.0)[1], 1.0)
+    turned = SE3.exp(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(compared(side, turned, 1.0)[1], 1.0)
+
+
+def test_uncertain_brightness_weighs_less_than_certain() -> None:
+    blind = SETTINGS.model_copy(update={"image_noise": 1e6})
+    off = {"weighed": [], "alike": []}
+    for k in range(0, 110, 10):
+        a, b = (prepare_reference(view(POSES[m], noise=2, seed=m, camera=LARGE)) for m in (k, k + 5))
+        truth = SE3.between(POSES[k], POSES[k + 5])
+        for name, settings in (("weighed", SETTINGS), ("alike", blind)):
+            off[name].append(error(align_frames(a, b, truth, settings).T_target_source, truth))
+    weighed, alike = (np.sqrt(np.mean(np.square(off[name]), axis=0)) for name in ("weighed", "alike"))
+    assert (weighed < alike).all()
+
+
+def test_the_shift_of_the_view_is_that_of_its_points() -> None:
+    side = side_of(POSES[3], POSES[4])
+    assert view_shift(side, np.eye(4)) == 0.0
+    for angle in (0.02, 0.1, 0.3):
+        shift = view_shift(side, SE3.exp(np.array([0.0, angle, 0.0, 0.0, 0.0, 0.0])))
+        # a turn moves the middle of the image by f tan(angle), its borders by more
+        assert 1.0 < shift / (side.camera[0] * np.tan(angle) / 160) < 1.35
+    assert view_shift(side, SE3.exp(np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))) == 0.0  # nothing in view
 
 
 def test_derivatives_of_the_offsets_are_those_of_the_distances() -> None:
@@ -199,8 +268,9 @@ def test_derivatives_of_the_offsets_are_those_of_the_distances() -> None:
         n = len(p)
 
         def distances(offsets: FloatArray, side=side, T=T, back=back, n=n) -> tuple[FloatArray, FloatArray]:
-            across, levers = np.empty(n), np.zeros((n, 3))
-            warp(side, T, back, offsets, 0.06, across, np.empty(n), np.zeros((n, 3)), levers, np.zeros(n, np.uint8))
+            across, levers, none = np.empty(n), np.zeros((n, 3)), np.empty(n)
+            warp(side, T, back, offsets, 0.06, 1.0, across, none, none.copy(), np.zeros((n, 3)), levers,
+                 np.zeros(n, np.uint8))  # fmt: skip
             return across, levers
 
         at = np.array([1e-3, -2e-3, 1e-3])
@@ -211,9 +281,6 @@ def test_derivatives_of_the_offsets_are_those_of_the_distances() -> None:
             known = np.isfinite(difference)
             assert known.sum() > 1000
             np.testing.assert_allclose(levers[known, a], difference[known], rtol=1e-4, atol=1e-3)
-
-
-LARGE = small_camera(320, 240)
 
 
 def test_features_find_a_wide_motion_that_alignment_alone_does_not() -> None:
