@@ -11,7 +11,8 @@ from posegraph_slam.arrays import FloatArray, frozen, read_only
 from posegraph_slam.errors import InputError
 from posegraph_slam.jit import kernel
 from posegraph_slam.registration.kd_tree import KdTree, build_kd_tree
-from posegraph_slam.registration.surface import Surface, fit_surface, spans_plane
+from posegraph_slam.registration.principal_axes import spans_plane
+from posegraph_slam.registration.surface import Surface, fit_surface
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -30,7 +30,8 @@ ROUNDS_IN_PLANE, ROUNDS_IN_SPACE = 1, 3
 def register(
     d: int, source: FloatArray, target: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray,
     value: FloatArray, anchors: FloatArray, normals: FloatArray, trust: FloatArray, thickness: FloatArray,
-    neighbours: IntArray, source_normals: FloatArray, start: FloatArray, residual: int, loss: int, options: FloatArray,
+    neighbours: IntArray, nearest: IntArray, source_normals: FloatArray, start: FloatArray, residual: int, loss: int,
+    options: FloatArray,
 ) -> tuple[FloatArray, int, int, int, FloatArray, FloatArray, float]:  # fmt: skip
     """Run the loop and describe its end: pose (d+1, d+1), status, rounds, pairs, information, free directions, RMSE.
 
@@ -44,7 +45,7 @@ def register(
             T[a, b] = start[a, b]
     known, reach, moved = nothing_known(len(source))
     T, status, iterations, s, t = run_loop(d, source, target, rows, leaves, axis, value, anchors, normals, trust,
-                                           neighbours, source_normals, T, residual, loss, options, known, reach,
+                                           nearest, source_normals, T, residual, loss, options, known, reach,
                                            moved)  # fmt: skip
     pose, p = np.eye(d + 1), 3 * (d - 1)
     for a in range(d):
@@ -57,7 +58,8 @@ def register(
     if options[12] == 0.0:
         return pose, status, iterations, len(s), np.zeros((p, p)), np.eye(p), rmse
     information, free = describe_end(d, source, target, rows, leaves, axis, value, anchors, normals, trust, thickness,
-                                     neighbours, T, s, t, residual, loss, options, known, reach, moved)  # fmt: skip
+                                     neighbours, nearest, T, s, t, residual, loss, options, known, reach,
+                                     moved)  # fmt: skip
     return pose, status, iterations, len(s), information, free, rmse
 
 
@@ -65,8 +67,8 @@ def register(
 def describe_end(
     d: int, source: FloatArray, target: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray,
     value: FloatArray, anchors: FloatArray, normals: FloatArray, trust: FloatArray, thickness: FloatArray,
-    neighbours: IntArray, T: FloatArray, s: IntArray, t: IntArray, residual: int, loss: int, options: FloatArray,
-    known: IntArray, reach: FloatArray, moved: FloatArray,
+    neighbours: IntArray, nearest: IntArray, T: FloatArray, s: IntArray, t: IntArray, residual: int, loss: int,
+    options: FloatArray, known: IntArray, reach: FloatArray, moved: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Information (p, p) of the pose T (4, 4) that a loop ended at with pairs s, t (m,), and the free directions.
 
@@ -78,7 +80,7 @@ def describe_end(
         u, v, square = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n)
         length, weight = np.empty(n), np.empty(n)
         for _ in range(ROUNDS_IN_PLANE if d == 2 else ROUNDS_IN_SPACE):
-            count = pair_nearest(reference, source, target, rows, leaves, axis, value, neighbours, options[0], known,
+            count = pair_nearest(reference, source, target, rows, leaves, axis, value, nearest, options[0], known,
                                  reach, moved, u, v, square)  # fmt: skip
             count = with_normals(d, normals, u, v, square, count)
             if count < max(options[6], 1):
@@ -94,7 +96,7 @@ def describe_end(
 @kernel
 def run_loop(
     d: int, source: FloatArray, target: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray,
-    value: FloatArray, anchors: FloatArray, normals: FloatArray, trust: FloatArray, neighbours: IntArray,
+    value: FloatArray, anchors: FloatArray, normals: FloatArray, trust: FloatArray, nearest: IntArray,
     source_normals: FloatArray, start: FloatArray, residual: int, loss: int, options: FloatArray, known: IntArray,
     reach: FloatArray, moved: FloatArray,
 ) -> tuple[FloatArray, int, int, IntArray, IntArray]:  # fmt: skip
@@ -112,7 +114,7 @@ def run_loop(
     square, weight, length = np.empty(n), np.empty(n), np.empty(n)
     for iteration in range(1, int(rounds) + 1):
         count = pair_nearest(
-            T, source, target, rows, leaves, axis, value, neighbours, gate, known, reach, moved, s, t, square
+            T, source, target, rows, leaves, axis, value, nearest, gate, known, reach, moved, s, t, square
         )
         if residual != POINT:
             count = with_normals(d, normals, s, t, square, count)

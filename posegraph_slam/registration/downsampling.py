@@ -7,7 +7,10 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import InputError
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
-from posegraph_slam.registration.surface import LONGEST_SHARE, shape_of_neighbourhoods
+from posegraph_slam.registration.kd_search import neighbours_of_all
+from posegraph_slam.registration.principal_axes import axes_of_all
+from posegraph_slam.registration.scan_lines import LONGEST_SHARE
+from posegraph_slam.registration.small_matrices import TINY
 from posegraph_slam.registration.voxel_hash import AXIS_BITS, voxel_keys
 
 EVEN_SHARE = 1.6
@@ -41,7 +44,7 @@ def thin_scan_lines(cloud: Cloud) -> Cloud:
     """
     if cloud.dimension != 3 or len(cloud) <= FEWEST:
         return cloud
-    shape, reach = shape_of_neighbourhoods(cloud.points, cloud.tree, cloud.neighbours)
+    shape, reach = shape_of_neighbourhoods(cloud)
     if shape <= LONGEST_SHARE:
         return cloud
     thinned, voxel_m = cloud, reach / 2
@@ -50,6 +53,15 @@ def thin_scan_lines(cloud: Cloud) -> Cloud:
         if len(coarser) < FEWEST:
             break
         thinned = prepare_cloud(coarser, neighbours=cloud.neighbours)
-        shape, _ = shape_of_neighbourhoods(thinned.points, thinned.tree, thinned.neighbours)
+        shape, _ = shape_of_neighbourhoods(thinned)
         voxel_m *= np.sqrt(2.0)
     return thinned
+
+
+def shape_of_neighbourhoods(cloud: Cloud) -> tuple[float, float]:
+    """Median length over width of the neighbourhoods of all points (n, 3), and the median of their reach."""
+    tree = cloud.tree
+    index = neighbours_of_all(tree.rows, tree.sorted_points, tree.axis, tree.value, cloud.neighbours)
+    _, _, variances = axes_of_all(cloud.points, index)
+    reach = np.linalg.norm(cloud.points[index[:, -1]] - cloud.points, axis=1)
+    return float(np.sqrt(np.median(variances[:, 2] / np.maximum(variances[:, 1], TINY)))), float(np.median(reach))

@@ -41,10 +41,10 @@ FAILURES = (RegistrationStatus.TOO_FEW_INLIERS, RegistrationStatus.DEGENERATE)
 RIGID_TOLERANCE, RIGID_ROUNDING = 2e-3, 1e-12
 """How far the axes of a guess may be from unit length and right angles, and how far without being corrected."""
 
-NO_NORMALS = read_only(np.zeros((1, 3)))
+NO_NORMALS, NO_ROWS = read_only(np.zeros((1, 3))), frozen(np.zeros((1, 1), dtype=np.int64))
 NO_SURFACE = Surface(
     anchors=NO_NORMALS, normals=NO_NORMALS, normals_in_space=NO_NORMALS, oriented=frozen(np.zeros(1, dtype=np.bool_)),
-    thickness_m=frozen(np.zeros(1)), trust=frozen(np.zeros(1)), neighbours=frozen(np.zeros((1, 1), dtype=np.int64)),
+    thickness_m=frozen(np.zeros(1)), trust=frozen(np.zeros(1)), neighbours=NO_ROWS, nearest=NO_ROWS,
 )  # fmt: skip
 """Stand for what does not count: it need not be fitted then."""
 
@@ -88,7 +88,7 @@ def _run_compiled(source: Cloud, target: Cloud, T: FloatArray, settings: IcpSett
         surface = target.surface
     pose, code, iterations, pairs, information, free, rmse = register(
         d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value, surface.anchors,
-        surface.normals_in_space, surface.trust, surface.thickness_m, surface.neighbours,
+        surface.normals_in_space, surface.trust, surface.thickness_m, surface.neighbours, surface.nearest,
         _source_normals(source, settings), T, residual, loss, options)  # fmt: skip
     status = STATUSES[code]
     if status in FAILURES:
@@ -138,8 +138,8 @@ def _described(
     p = 3 * (d - 1)
     information, free = (np.zeros((p, p)), np.eye(p)) if not settings.uncertainty else describe_end(
         d, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis, tree.value, surface.anchors,
-        normals, surface.trust, surface.thickness_m, surface.neighbours, in_space, s, t, residual, loss,
-        options, *nothing_known(len(source)))  # fmt: skip
+        normals, surface.trust, surface.thickness_m, surface.neighbours, surface.nearest, in_space, s, t, residual,
+        loss, options, *nothing_known(len(source)))  # fmt: skip
     return RegistrationResult(T_target_source=T, status=status, inliers=len(pairs),
                               inlier_fraction=len(pairs) / len(source), rmse_m=rmse, information=information,
                               degenerate_directions=free, iterations=iterations)  # fmt: skip

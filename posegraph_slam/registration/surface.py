@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray, frozen
-from posegraph_slam.jit import inline_kernel, kernel
+from posegraph_slam.jit import kernel
 from posegraph_slam.registration.kd_search import neighbours_of_all
 from posegraph_slam.registration.kd_tree import KdTree
+from posegraph_slam.registration.principal_axes import LINE_TOLERANCE, axes_of_all
+from posegraph_slam.registration.scan_lines import LONGEST_SHARE, widen_rows
 from posegraph_slam.registration.selection import middle_of
-from posegraph_slam.registration.small_matrices import TINY, least_axis_in_plane, least_axis_in_space
-
-LINE_TOLERANCE = 1e-12
-"""Share of the largest variance under which the next one is rounding: the points lie on one line."""
+from posegraph_slam.registration.small_matrices import TINY
 
 USUAL_THICKNESSES = 2.0
 """Thickness, in medians of the cloud, at which a fitted line or plane is trusted by half."""
@@ -24,12 +23,6 @@ THINNEST_M = 1e-6
 
 THICKEST_SHARE = 0.3
 """Median thickness of the neighbourhoods in the plane, over their length, from which on they are too short."""
-
-LONGEST_SHARE = 3.0
-"""Median length of the neighbourhoods in space, over their width, from which on they are rows of one scan line.
-
-Real scans in space have 1.3 to 1.8 where they are thinned, and 11 where they are not: 69 000 points of 64 lines.
-"""
 
 SHARE_GAINED = 0.75
 """What is left of that median, at most, when neighbourhoods grow by half their length or more along a line."""
@@ -44,7 +37,8 @@ class Surface:
     `anchors` (n, d) lie on them, `normals` (n, d) are unit and signless, zero where not `oriented` (n,): fewer than d
     neighbours, or all on one spot (one line in 3D). `normals_in_space` (n, 3) have a zero as third in the plane.
     `thickness_m` (n,) is the neighbours' standard deviation about the fit, and `trust` (n,) in [0, 1] falls with it:
-    corners and edges of shadows are thick, walls are not.
+    corners and edges of shadows are thick, walls are not. `nearest` (n, k) are the rows of the nearest points; they are
+    the neighbours but where these would lie on one line of a scan in space.
     """
 
     anchors: FloatArray
@@ -54,6 +48,7 @@ class Surface:
     thickness_m: FloatArray
     trust: FloatArray
     neighbours: IntArray
+    nearest: IntArray
 
 
 def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
@@ -61,77 +56,73 @@ def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
 
     The anchor is the mean of the neighbours: a matcher that paired with raw points would pick, among points denser
     than their noise, those that err towards the source, and would be drawn to its own guess. Where a mean leaves a
-    curved surface, the anchor is moved back to it. Neighbourhoods that are thick for their length in the plane (1081
-    beams with 3 cm noise), or rows of a scan line in space, whose planes turn about them at will, are doubled, up to
-    four times.
+    curved surface, the anchor is moved back to it. In the plane, neighbourhoods that are thick for their length
+    (1081 beams with 3 cm noise) are doubled, up to four times. In space, those that lie on one line of a scan are
+    taken from farther around (`widen_rows`).
     """
     n, d = points.shape
     count = min(neighbours, n) if n >= d else 0
-    anchors, normals, spread, oriented, thickness, trust, index = fit_all(
-        points, tree.rows, tree.sorted_points, tree.axis, tree.value, count)  # fmt: skip
-    return Surface(anchors=frozen(anchors), normals=frozen(normals), normals_in_space=frozen(spread),
+    if d == 2:
+        anchors, normals, spread, oriented, thickness, trust, index = fit_in_plane(
+            points, tree.rows, tree.sorted_points, tree.axis, tree.value, count)  # fmt: skip
+        return Surface(anchors=frozen(anchors), normals=frozen(normals), normals_in_space=frozen(spread),
+                       oriented=frozen(oriented), thickness_m=frozen(thickness), trust=frozen(trust),
+                       neighbours=frozen(index), nearest=frozen(index))  # fmt: skip
+    index = neighbours_of_all(tree.rows, tree.sorted_points, tree.axis, tree.value, count)
+    anchors, normals, variances = axes_of_all(points, index)
+    support = widen_rows(points, index, anchors, normals, variances)
+    oriented, thickness, trust, _ = judge_fits(points, support, anchors, normals, variances)
+    return Surface(anchors=frozen(anchors), normals=frozen(normals), normals_in_space=frozen(normals),
                    oriented=frozen(oriented), thickness_m=frozen(thickness), trust=frozen(trust),
-                   neighbours=frozen(index))  # fmt: skip
-
-
-def shape_of_neighbourhoods(points: FloatArray, tree: KdTree, neighbours: int) -> tuple[float, float]:
-    """Median length over width of the `neighbours` nearest points of all points (n, 3), and median of their reach.
-
-    Points that are spread evenly over a surface have a length of 1.5 times the width.
-    """
-    index = neighbours_of_all(tree.rows, tree.sorted_points, tree.axis, tree.value, min(neighbours, len(points)))
-    reach = np.linalg.norm(points[index[:, -1]] - points, axis=1)
-    return float(fit_neighbourhoods(points, index)[5]), float(np.median(reach))
+                   neighbours=frozen(support), nearest=frozen(index))  # fmt: skip
 
 
 @kernel
-def fit_all(
+def fit_in_plane(
     points: FloatArray, rows: IntArray, leaves: FloatArray, axis: IntArray, value: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray, IntArray]:
-    """Fit `count` neighbours at every point, or up to four times as many; the fields of a `Surface`."""
-    n, d = points.shape
-    limit = THICKEST_SHARE if d == 2 else LONGEST_SHARE
+    """Fit `count` neighbours, or up to four times as many, at points (n, 2): the fields of a `Surface`."""
     index = neighbours_of_all(rows, leaves, axis, value, count)
-    anchors, normals, oriented, thickness, trust, share = fit_neighbourhoods(points, index)
+    anchors, normals, variances = axes_of_all(points, index)
+    oriented, thickness, trust, share = judge_fits(points, index, anchors, normals, variances)
     for _ in range(MOST_DOUBLINGS):
-        if share <= limit or 2 * count > n:
+        if share <= THICKEST_SHARE or 2 * count > len(points):
             break
         wider = neighbours_of_all(rows, leaves, axis, value, 2 * count)
-        other = fit_neighbourhoods(points, wider)
-        if other[5] > SHARE_GAINED * share:
+        means, across, variances = axes_of_all(points, wider)
+        other = judge_fits(points, wider, means, across, variances)
+        if other[3] > SHARE_GAINED * share:
             break
-        anchors, normals, oriented, thickness, trust, share = other
-        index, count = wider, 2 * count
-    spread = np.zeros((n, 3))
-    for row in range(n):
-        for a in range(d):
-            spread[row, a] = normals[row, a]
+        anchors, normals, index, count = means, across, wider, 2 * count
+        oriented, thickness, trust, share = other
+    spread = np.zeros((len(points), 3))
+    for row in range(len(points)):
+        spread[row, 0], spread[row, 1] = normals[row, 0], normals[row, 1]
     return anchors, normals, spread, oriented, thickness, trust, index
 
 
 @kernel
-def fit_neighbourhoods(
-    points: FloatArray, neighbours: IntArray
-) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray, FloatArray, float]:
-    """Anchors and normals (n, d), oriented, thickness and trust (n,) of points fitted to those named by rows (n, k).
+def judge_fits(
+    points: FloatArray, neighbours: IntArray, anchors: FloatArray, normals: FloatArray, variances: FloatArray
+) -> tuple[BoolArray, FloatArray, FloatArray, float]:
+    """Oriented, thickness and trust (n,) of what `axes_of_all` fitted, whose anchors move back to the surface.
 
-    Last comes the median thickness of the neighbourhoods over their length in the plane, of length over width in space.
+    Last comes the median thickness of the neighbourhoods over their second longest side, in the plane their length.
     """
     n, k = neighbours.shape
     d = points.shape[1]
-    anchors, normals, share = points.copy(), np.zeros((n, d)), np.zeros(n)
     oriented, thickness, trust = np.zeros(n, dtype=np.bool_), np.zeros(n), np.zeros(n)
     if k == 0:
-        return anchors, normals, oriented, thickness, trust, 0.0
-    some, shares, count, space = np.empty(n), np.empty(n), 0, d == 3
+        anchors[:], normals[:] = points, 0.0
+        return oriented, thickness, trust, 0.0
+    some, shares, count = np.empty(n), np.empty(n), 0
     for row in range(n):
-        least, second, largest = fit_principal_axes(points, neighbours, row, anchors, normals)
+        least, second, largest = variances[row, 0], variances[row, 1], variances[row, 2]
         oriented[row] = second > LINE_TOLERANCE * max(largest, TINY)
         # the fit spends d degrees of freedom on k points
-        thickness[row] = np.sqrt(max(least, 0.0) * k / max(k - d, 1))
+        thickness[row] = np.sqrt(least * k / max(k - d, 1))
         if oriented[row]:
-            share[row] = max(least, 0.0) / second
-            some[count], shares[count] = thickness[row], largest / second if space else share[row]
+            some[count], shares[count] = thickness[row], least / second
             count += 1
         else:
             for a in range(d):
@@ -139,46 +130,13 @@ def fit_neighbourhoods(
     usual = middle_of(some, count) if count > 0 else 0.0
     for row in range(n):
         if oriented[row]:
-            # a neighbourhood as thick as it is long has no direction
+            # a neighbourhood as thick as it is long has no direction, one in space as wide as it is thick neither
             thick = thickness[row] / max(USUAL_THICKNESSES * usual, THINNEST_M)
-            trust[row] = (1.0 - share[row]) / (1.0 + thick * thick)
+            trust[row] = (1.0 - variances[row, 0] / variances[row, 1]) / (1.0 + thick * thick)
+            if d == 3:
+                trust[row] *= min(LONGEST_SHARE * LONGEST_SHARE * variances[row, 1] / variances[row, 2], 1.0)
     return_to_surface(points, neighbours, anchors, normals, trust)
-    return anchors, normals, oriented, thickness, trust, np.sqrt(middle_of(shares, count)) if count > 0 else 0.0
-
-
-@inline_kernel
-def fit_principal_axes(
-    points: FloatArray, neighbours: IntArray, row: int, anchors: FloatArray, normals: FloatArray
-) -> tuple[float, float, float]:
-    """Write mean and least principal axis of one neighbourhood; its smallest, second and largest variance."""
-    k, d = neighbours.shape[1], points.shape[1]
-    first, share = neighbours[row, 0], 1.0 / k  # coordinates are taken from it: no digits are lost far from the origin
-    x0, y0, z0 = points[first, 0], points[first, 1], points[first, 2] if d == 3 else 0.0
-    x, y, z, xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    if d == 2:
-        for j in range(1, k):
-            at = neighbours[row, j]
-            u, v = points[at, 0] - x0, points[at, 1] - y0
-            x, y = x + u, y + v
-            xx, xy, yy = xx + u * u, xy + u * v, yy + v * v
-        x, y = x * share, y * share
-        anchors[row, 0], anchors[row, 1] = x0 + x, y0 + y
-        normals[row, 0], normals[row, 1], least, largest = least_axis_in_plane(
-            xx * share - x * x, xy * share - x * y, yy * share - y * y)  # fmt: skip
-        second = largest
-    else:
-        for j in range(1, k):
-            at = neighbours[row, j]
-            u, v, w = points[at, 0] - x0, points[at, 1] - y0, points[at, 2] - z0
-            x, y, z = x + u, y + v, z + w
-            xx, xy, xz = xx + u * u, xy + u * v, xz + u * w
-            yy, yz, zz = yy + v * v, yz + v * w, zz + w * w
-        x, y, z = x * share, y * share, z * share
-        anchors[row, 0], anchors[row, 1], anchors[row, 2] = x0 + x, y0 + y, z0 + z
-        normals[row, 0], normals[row, 1], normals[row, 2], least, second, largest = least_axis_in_space(
-            xx * share - x * x, xy * share - x * y, xz * share - x * z, yy * share - y * y, yz * share - y * z,
-            zz * share - z * z)  # fmt: skip
-    return least, second, largest
+    return oriented, thickness, trust, np.sqrt(middle_of(shares, count)) if count > 0 else 0.0
 
 
 @kernel
@@ -216,30 +174,3 @@ def return_to_surface(
         anchors[row, 1] += shift[row] * normals[row, 1]
         if space:
             anchors[row, 2] += shift[row] * normals[row, 2]
-
-
-@kernel
-def spans_plane(points: FloatArray) -> bool:
-    """Whether finite points (n, 2) or (n, 3) vary along two directions at least."""
-    n, d = points.shape
-    if n < 3:
-        return False
-    x, y, z = 0.0, 0.0, 0.0
-    for row in range(n):
-        x += points[row, 0] / n
-        y += points[row, 1] / n
-        z += points[row, 2] / n if d == 3 else 0.0
-    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for row in range(n):
-        u, v, w = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z if d == 3 else 0.0
-        xx += u * u
-        xy += u * v
-        xz += u * w
-        yy += v * v
-        yz += v * w
-        zz += w * w
-    if d == 2:
-        _, _, second, largest = least_axis_in_plane(xx, xy, yy)
-    else:
-        _, _, _, _, second, largest = least_axis_in_space(xx, xy, xz, yy, yz, zz)
-    return bool(second > LINE_TOLERANCE * largest)

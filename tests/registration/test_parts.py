@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, SE3, Group, align_points
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
-from posegraph_slam.registration.downsampling import EVEN_SHARE, thin_scan_lines
+from posegraph_slam.registration.downsampling import EVEN_SHARE, shape_of_neighbourhoods, thin_scan_lines
 from posegraph_slam.registration.icp import has_settled
 from posegraph_slam.registration.pairing import (
     Association,
@@ -26,7 +26,6 @@ from posegraph_slam.registration.pairing import (
 )
 from posegraph_slam.registration.residuals import PointToPlane, PointToPoint, linearise, plane_residuals
 from posegraph_slam.registration.settings import IcpSettings
-from posegraph_slam.registration.surface import shape_of_neighbourhoods
 
 searches = pytest.mark.parametrize("search", [by_tree, by_voxel_hash])
 spaces = pytest.mark.parametrize("group", [SE2, SE3], ids=["2d", "3d"])
@@ -54,15 +53,19 @@ def test_normals_of_a_round_thing_point_outward(group: Group) -> None:
     assert np.quantile(cosine, 0.01) > 0.99
 
 
-def test_rows_of_one_scan_line_are_widened_until_they_hold_a_plane() -> None:
+def test_neighbours_on_one_scan_line_are_taken_from_farther_around() -> None:
+    """On the floor, noise along the rays and a line span a thin cone, which is not the floor."""
     rng = np.random.default_rng(0)
-    along, across = np.meshgrid(np.arange(0.0, 4.0, 0.02), np.arange(0.0, 3.0, 0.15))
-    points = np.stack([along.ravel(), across.ravel(), np.zeros(along.size)], axis=1)
-    surface = prepare_cloud(points + rng.normal(0, 0.002, points.shape), neighbours=10).surface
-    assert surface.neighbours.shape[1] == 20
+    bearing, depression = np.meshgrid(np.linspace(-np.pi, np.pi, 900), np.radians([8.0, 10.0, 12.0, 14.0, 16.0, 18.0]))
+    ranges = 1.5 / np.sin(depression) + rng.normal(0, 0.01, bearing.shape)
+    rays = np.stack([np.cos(depression) * np.cos(bearing), np.cos(depression) * np.sin(bearing), -np.sin(depression)])
+    cloud = prepare_cloud((rays * ranges).reshape(3, -1).T)
+    surface = cloud.surface
+    np.testing.assert_array_equal(surface.nearest[:, 0], np.arange(len(cloud)))
+    assert np.mean(np.any(surface.neighbours != surface.nearest, axis=1)) > 0.9
     assert np.quantile(np.abs(surface.normals[:, 2]), 0.02) > np.cos(np.radians(3))
-    even = prepare_cloud(points[rng.permutation(len(points))[:400]], neighbours=10).surface
-    assert even.neighbours.shape[1] == 10
+    even = prepare_cloud(rng.uniform(0, 1, (4000, 3)) * [4, 3, 0.01]).surface
+    assert np.mean(np.any(even.neighbours != even.nearest, axis=1)) < 0.02
 
 
 def test_dense_scan_lines_are_thinned_until_they_are_even() -> None:
@@ -72,7 +75,7 @@ def test_dense_scan_lines_are_thinned_until_they_are_even() -> None:
     thinned = thin_scan_lines(prepare_cloud(points + rng.normal(0, 0.002, points.shape)))
     assert len(np.unique(np.round(thinned.points[:, 1] / 0.15))) == 40  # all lines are left
     assert 3000 < len(thinned) < 8000
-    assert shape_of_neighbourhoods(thinned.points, thinned.tree, 10)[0] <= EVEN_SHARE
+    assert shape_of_neighbourhoods(thinned)[0] <= EVEN_SHARE
     for few_or_even in (prepare_cloud(points[::40]), prepare_cloud(rng.uniform(0, 1, (3000, 3)) * [6, 6, 0.01]),
                         prepare_cloud(points[:, :2])):  # fmt: skip
         assert thin_scan_lines(few_or_even) is few_or_even
