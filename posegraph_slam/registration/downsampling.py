@@ -6,9 +6,11 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import InputError
+from posegraph_slam.geometry import inverse_pose, transform_points
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
 from posegraph_slam.registration.kd_search import neighbours_of_all
 from posegraph_slam.registration.principal_axes import axes_of_all
+from posegraph_slam.registration.rotation_grid import principal_frame
 from posegraph_slam.registration.scan_lines import LONGEST_SHARE
 from posegraph_slam.registration.small_matrices import TINY
 from posegraph_slam.registration.voxel_hash import AXIS_BITS, voxel_keys
@@ -40,16 +42,18 @@ def thin_scan_lines(cloud: Cloud) -> Cloud:
     """Thin a cloud in space whose points lie on few dense lines until they are spread evenly; others are left alone.
 
     Of a scan of 64 lines most points lie on the few lines near the scanner: they would outvote all walls, and
-    neighbours on one line hold no plane. The voxel grows by the root of two from half the neighbours' reach.
+    neighbours on one line hold no plane. The voxel grows by the root of two from half the neighbours' reach, in a grid
+    that turns with the cloud.
     """
     if cloud.dimension != 3 or len(cloud) <= FEWEST:
         return cloud
     shape, reach = shape_of_neighbourhoods(cloud)
     if shape <= LONGEST_SHARE:
         return cloud
-    thinned, voxel_m = cloud, reach / 2
+    thinned, voxel_m, frame = cloud, reach / 2, principal_frame(cloud.points)
+    framed = transform_points(inverse_pose(frame), cloud.points)
     while shape > EVEN_SHARE:
-        coarser = downsample(cloud.points, voxel_m)
+        coarser = transform_points(frame, downsample(framed, voxel_m))
         if len(coarser) < FEWEST:
             break
         thinned = prepare_cloud(coarser, neighbours=cloud.neighbours)

@@ -41,7 +41,8 @@ def principal_frame(points: FloatArray) -> FloatArray:
     centred = points - centre
     _, vectors = np.linalg.eigh(centred.T @ centred)
     axes = vectors[:, ::-1].copy()
-    skewness = np.sum((centred @ axes) ** 3, axis=0)
+    along = centred @ axes
+    skewness = np.sum(along * along * along, axis=0)
     axes *= np.where(skewness < 0, -1.0, 1.0)
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     T = np.eye(4)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.geometry import inverse_pose, transform_points
 from posegraph_slam.jit import kernel
 from posegraph_slam.registration.kd_search import nearest_several
 from posegraph_slam.registration.kd_tree import build_kd_tree
 from posegraph_slam.registration.principal_axes import axes_of_all
+from posegraph_slam.registration.rotation_grid import principal_frame
 from posegraph_slam.registration.voxel_hash import AXIS_BITS, voxel_keys
 
 LONGEST_SHARE = 3.0
@@ -26,19 +28,21 @@ def widen_rows(
     Noise lies along the rays, so that a row on the floor spans a thin plane with its rays, the cone of its own line,
     whatever the floor: two scans of few lines would match these cones, wherever the scanner has gone to. Rows take
     their neighbours from a part of the cloud with one point a voxel, whose side doubles until they are rows no more.
-    Their means, normals and variances, from `axes_of_all`, are written.
+    The grid stands in the principal frame of the cloud, and so turns with it. Means, normals and variances of the rows,
+    from `axes_of_all`, are written.
     """
     rows = np.flatnonzero(variances[:, 2] > LONGEST_SHARE**2 * variances[:, 1])
     if len(rows) == 0:
         return nearest
     support, k = nearest.copy(), nearest.shape[1]
     voxel_m = float(np.median(np.linalg.norm(points[nearest[rows, -1]] - points[rows], axis=1)))
-    extent = float(np.ptp(points, axis=0).max())
+    framed = transform_points(inverse_pose(principal_frame(points)), points)
+    extent = float(np.ptp(framed, axis=0).max())
     part = np.arange(len(points))
     for _ in range(MOST_LEVELS):
         if not extent < voxel_m * (2**AXIS_BITS - 1):
             break
-        part = part[one_a_voxel(points[part], voxel_m)]
+        part = part[one_a_voxel(framed[part], voxel_m)]
         if len(rows) == 0 or len(part) < k:
             break
         tree = build_kd_tree(points[part])

@@ -46,7 +46,7 @@ def test_pairs_stay_the_nearest_ones_on_every_way(dimension: int, linked: bool) 
     rng = np.random.default_rng(1)
     target, source = (prepare_cloud(rng.uniform(0, 3, (200, dimension))) for _ in range(2))
     tree = target.tree
-    table = target.surface.neighbours if linked else np.zeros((1, 1), dtype=np.int64)
+    table = target.surface.nearest if linked else np.zeros((1, 1), dtype=np.int64)
     memory, T, gate = nothing_known(200), np.eye(4), 0.3
     s, t, square = np.empty(200, dtype=np.int64), np.empty(200, dtype=np.int64), np.empty(200)
     for step in (0.5, 0.3, 0.05, 0.02, 0.0, 0.004, 0.2, 0.001):
@@ -72,7 +72,7 @@ def test_rounding_hides_no_point_as_near_as_the_bound_of_a_search(dimension: int
         for _ in range(4):
             T[:dimension, 3] += rng.normal(0, 0.1, dimension)
             count = pair_nearest(T, source.in_space, target.in_space, tree.rows, tree.sorted_points, tree.axis,
-                                 tree.value, target.surface.neighbours, gate, *memory, s, t, square)  # fmt: skip
+                                 tree.value, target.surface.nearest, gate, *memory, s, t, square)  # fmt: skip
             squares = np.sum((source.in_space[:, None] + T[:3, 3] - target.in_space[None]) ** 2, axis=2)
             assert count == 99
             np.testing.assert_array_equal(t, squares.argmin(axis=1))
