@@ -6,13 +6,13 @@ import numpy as np
 
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.jit import inline_kernel, kernel
-from posegraph_slam.registration.small_matrices import TINY, cholesky_in_place, inverse_of_positive, symmetric_eigen
-
-LEAST_WIDTH = 0.002
-"""Share of the squared length of a neighbourhood in space that its width is taken to have at least.
-
-A row of points hardly holds the turn of its plane about it: the lever across the row is not stretched without limit.
-"""
+from posegraph_slam.registration.small_matrices import (
+    TINY,
+    cholesky_in_place,
+    congruent,
+    inverse_of_positive,
+    symmetric_eigen,
+)
 
 TWICED_IN_PLANE = 5.0 / 3.0
 """Variance of an anchor on a line over that of the plain mean of its k neighbours.
@@ -24,29 +24,26 @@ square. In space neighbourhoods are not so even, and no such excess is seen.
 
 @kernel
 def score_products(
-    d: int, scores: FloatArray, offset: FloatArray, weight: FloatArray, gaps: FloatArray, thickness: FloatArray,
-    anchors: FloatArray, target: FloatArray, normals: FloatArray, neighbours: IntArray, t: IntArray, floor: float,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Sum M (p, p) of the outer products of all points' scores, each times the deviation of its point, and `near`.
+    d: int, scores: FloatArray, offset: FloatArray, weight: FloatArray, lever: FloatArray, thickness: FloatArray,
+    target: FloatArray, neighbours: IntArray, t: IntArray, floor: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Covariances (p, p) of the sum of scores: by the source points, by the target points, and `near`.
 
-    `scores` (m, p) are weight times Jacobian, `offset` (m,) the distances, `gaps` (m, 3) from anchor to source point.
+    `scores` (m, p) are weight times Jacobian, `offset` (m,) the distances, `lever` (m, k) from `levers_of`.
     The source's part is that of White (1980), each pair with its own distance. A target point moves every pair that
     leans on it, by its lever; its noise follows the thickness of the fits, whose common scale is set by the
-    weighted distances themselves: dense fits look thinner than the noise is. `near` (p, p) is what the distances of
-    neighbours say together: where they agree more than M explains, by a standard error (a variance of m / k
-    independent sums is known to the share (2 k / m)^0.5), their joint scores count instead.
+    weighted distances themselves: dense fits look thinner than the noise is. `near` is what the distances of
+    neighbours say together. A variance of m / k independent sums is known to the share (2 k / m)^0.5. Last come the
+    variances (m,) of the source points.
     """
     count, p = scores.shape
     k_all = neighbours.shape[1]
-    lever, variance, thick = np.empty((count, k_all)), np.empty(count), np.empty(count)
-    if d == 2:
-        levers_on_lines(gaps, target, anchors, normals, neighbours, t, lever)
-    else:
-        levers_on_planes(gaps, target, anchors, normals, neighbours, t, lever)
+    variance, thick = np.empty(count), np.empty(count)
     seen, expected, twiced = 0.0, 0.0, TWICED_IN_PLANE if d == 2 else 1.0
+    own = share_of_source(d, k_all)
     for k in range(count):
         sigma, squares = max(abs(offset[k]), floor), 1.0
-        thick[k], variance[k] = max(thickness[t[k]], floor), sigma * sigma / (1.0 + twiced / k_all)
+        thick[k], variance[k] = max(thickness[t[k]], floor), sigma * sigma * own
         for j in range(k_all):
             squares += twiced * lever[k, j] * lever[k, j]
         seen += (weight[k] * sigma) ** 2
@@ -55,9 +52,51 @@ def score_products(
     for a in range(0, p, 3):
         spread_scores(scores, a, offset, thick, lever, neighbours, t, leaning, joint)
     everyone = np.full(len(target), seen / max(expected, TINY))
-    M = weighted_squares(scores, variance) + weighted_squares(leaning, everyone)
+    targets = weighted_squares(leaning, everyone)
     everyone[:] = 1.0 / k_all
-    return M, weighted_squares(joint, everyone)
+    return weighted_squares(scores, variance), targets, weighted_squares(joint, everyone), variance
+
+
+@inline_kernel
+def share_of_source(d: int, k_all: int) -> float:
+    """Variance of a source point over that of its distance to a line or plane through k points as noisy as it is."""
+    return 1.0 / (1.0 + (TWICED_IN_PLANE if d == 2 else 1.0) / k_all)
+
+
+@kernel
+def fitted_away(
+    d: int, jacobian: FloatArray, scores: FloatArray, weight: FloatArray, variance: FloatArray, covariance: FloatArray,
+    vectors: FloatArray, k_all: int,
+) -> tuple[FloatArray, float]:  # fmt: skip
+    """What the source's part (p, p) of the scores' covariance lacks, and the factor by which the target's part grows.
+
+    At the estimate distances are smaller than at the truth, by as much as it follows them: the square of each lacks
+    j C j^T, for its row j of the Jacobian and the covariance C (h, h) of the held directions (the leverage of
+    MacKinnon and White 1985, by C itself because neighbours share the noise of their targets).
+    """
+    count, p = jacobian.shape
+    free = p - len(covariance)
+    whole, lacking = np.zeros((p, p)), np.empty(count)
+    whole[free:, free:] = covariance
+    whole = congruent(whole, vectors.T, 0)
+    own, lost, seen = share_of_source(d, k_all), 0.0, 0.0
+    lacking[:] = 0.0
+    for a in range(0, p, 3):
+        for b in range(0, p, 3):
+            xx, xy, xz = whole[a, b], whole[a, b + 1], whole[a, b + 2]
+            yx, yy, yz = whole[a + 1, b], whole[a + 1, b + 1], whole[a + 1, b + 2]
+            zx, zy, zz = whole[a + 2, b], whole[a + 2, b + 1], whole[a + 2, b + 2]
+            for k in range(count):
+                x, y, z = jacobian[k, b], jacobian[k, b + 1], jacobian[k, b + 2]
+                lacking[k] += own * (
+                    jacobian[k, a] * (xx * x + xy * y + xz * z)
+                    + jacobian[k, a + 1] * (yx * x + yy * y + yz * z)
+                    + jacobian[k, a + 2] * (zx * x + zy * y + zz * z)
+                )
+    for k in range(count):
+        lost += weight[k] ** 2 * lacking[k]
+        seen += weight[k] ** 2 * variance[k]
+    return weighted_squares(scores, lacking), 1.0 + lost / max(seen, TINY)
 
 
 @kernel
@@ -107,75 +146,6 @@ def weighted_squares(rows: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 @kernel
-def levers_on_lines(
-    gaps: FloatArray, target: FloatArray, anchors: FloatArray, normals: FloatArray, neighbours: IntArray, t: IntArray,
-    lever: FloatArray,
-) -> None:  # fmt: skip
-    """Write how far the neighbours of its target move the distance of a pair: (m, k).
-
-    The line is the regression on its k neighbours: with their places u_j about the anchor, of covariance C, one of
-    them moves the distance of a source point at u by (1 + u C^-1 u_j) / k times its own noise, which counts as far as
-    the normals agree.
-    """
-    k_all = neighbours.shape[1]
-    x, share = np.empty(k_all), 1.0 / k_all
-    for k in range(len(t)):
-        at = t[k]
-        n0, n1, a0, a1, xx = normals[at, 0], normals[at, 1], anchors[at, 0], anchors[at, 1], 0.0
-        for j in range(k_all):
-            row = neighbours[at, j]
-            along = n0 * (target[row, 1] - a1) - n1 * (target[row, 0] - a0)
-            x[j], lever[k, j] = along, share * (n0 * normals[row, 0] + n1 * normals[row, 1])
-            xx += along * along
-        slope = k_all * (n0 * gaps[k, 1] - n1 * gaps[k, 0]) / xx if xx > 0 else 0.0
-        for j in range(k_all):
-            lever[k, j] *= 1.0 + slope * x[j]
-
-
-@kernel
-def levers_on_planes(
-    gaps: FloatArray, target: FloatArray, anchors: FloatArray, normals: FloatArray, neighbours: IntArray, t: IntArray,
-    lever: FloatArray,
-) -> None:  # fmt: skip
-    """Do on planes what `levers_on_lines` does on lines."""
-    k_all = neighbours.shape[1]
-    x, y, share = np.empty(k_all), np.empty(k_all), 1.0 / k_all
-    for k in range(len(t)):
-        at, xx, xy, yy = t[k], 0.0, 0.0, 0.0
-        n0, n1, n2 = normals[at, 0], normals[at, 1], normals[at, 2]
-        a0, a1, a2 = anchors[at, 0], anchors[at, 1], anchors[at, 2]
-        e0, e1, e2, f0, f1, f2 = tangents(n0, n1, n2)
-        for j in range(k_all):
-            row = neighbours[at, j]
-            u, v, w = target[row, 0] - a0, target[row, 1] - a1, target[row, 2] - a2
-            p, q = u * e0 + v * e1 + w * e2, u * f0 + v * f1 + w * f2
-            x[j], y[j] = p, q
-            lever[k, j] = share * (n0 * normals[row, 0] + n1 * normals[row, 1] + n2 * normals[row, 2])
-            xx, xy, yy = xx + p * p, xy + p * q, yy + q * q
-        gx = gaps[k, 0] * e0 + gaps[k, 1] * e1 + gaps[k, 2] * e2
-        gy = gaps[k, 0] * f0 + gaps[k, 1] * f1 + gaps[k, 2] * f2
-        width = LEAST_WIDTH * (xx + yy)
-        xx, yy = xx + width, yy + width
-        det = xx * yy - xy * xy
-        inverse = k_all / det if det > 0 else 0.0
-        gx, gy = inverse * (yy * gx - xy * gy), inverse * (xx * gy - xy * gx)
-        for j in range(k_all):
-            lever[k, j] *= 1.0 + gx * x[j] + gy * y[j]
-
-
-@inline_kernel
-def tangents(n0: float, n1: float, n2: float) -> tuple[float, float, float, float, float, float]:
-    """Two unit vectors across the unit normal (n0, n1, n2); in the plane, n2 = 0, the first one lies in it."""
-    if abs(n2) < 0.8:
-        size = max(np.sqrt(n0 * n0 + n1 * n1), TINY)
-        e0, e1, e2 = -n1 / size, n0 / size, 0.0
-    else:
-        size = np.sqrt(n1 * n1 + n2 * n2)
-        e0, e1, e2 = 0.0, -n2 / size, n1 / size
-    return e0, e1, e2, n1 * e2 - n2 * e1, n2 * e0 - n0 * e2, n0 * e1 - n1 * e0
-
-
-@kernel
 def larger_of(M: FloatArray, other: FloatArray, least_ratio: float) -> FloatArray:
     """Matrix (h, h) that is M, but as large as `other` where that is more than `least_ratio` times as large."""
     h, rest = len(M), least_ratio * M - other
@@ -200,17 +170,22 @@ def larger_of(M: FloatArray, other: FloatArray, least_ratio: float) -> FloatArra
 
 
 @kernel
-def at_least_along(covariance: FloatArray, pull: FloatArray) -> FloatArray:
-    """Positive matrix (h, h) that is `covariance`, or larger along a vector (h,) so that it holds its outer square."""
+def with_gap(covariance: FloatArray, gap: FloatArray) -> FloatArray:
+    """Second moment (h, h) of the error of an estimate that lies a gap g (h,) beside one of covariance C.
+
+    If no estimate were better than the latter, the gap would be independent of its error (Hausman 1978), and the
+    second moment C + g g^T. But errors of the latter may not be shared: up to the smaller one of C and g g^T, and twice
+    as much goes off the moment. With half of that it is the larger one of C and g g^T. Neither is known so well, from
+    one gap, that it could be told which is smaller where they are alike: with q = g^T C^-1 g and the smooth
+    q / (1 + q^2)^0.5 instead of min(1, q) it is C + (1 - (1 + q^2)^-0.5) g g^T.
+    """
     inverse, exists = inverse_of_positive(covariance)
-    size = 0.0
-    for a in range(len(pull)):
-        for b in range(len(pull)):
-            size += pull[a] * inverse[a, b] * pull[b]
-    if not exists or size <= 1.0:
-        return covariance
-    result = covariance.copy()
-    for a in range(len(pull)):
-        for b in range(len(pull)):
-            result[a, b] += (1.0 - 1.0 / size) * pull[a] * pull[b]
+    q, result = 0.0, covariance.copy()
+    for a in range(len(gap)):
+        for b in range(len(gap)):
+            q += gap[a] * inverse[a, b] * gap[b]
+    if exists:
+        for a in range(len(gap)):
+            for b in range(len(gap)):
+                result[a, b] += (1.0 - 1.0 / np.sqrt(1.0 + q * q)) * gap[a] * gap[b]
     return result
