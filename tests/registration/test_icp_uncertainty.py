@@ -41,6 +41,36 @@ def test_information_is_calibrated_in_rooms(
     assert low < np.mean(nees) < high
 
 
+@pytest.mark.parametrize(("beams", "sigma_m"), [(361, 0.02), (1081, 0.02)])
+def test_information_is_calibrated_where_only_short_ends_hold_a_corridor(
+    beams: int, sigma_m: float, simulated: SimpleNamespace
+) -> None:
+    walls = np.array([[[-8, -1], [8, -1]], [[8, -1], [8, 1]], [[8, 1], [-8, 1]], [[-8, 1], [-8, -1]]], dtype=np.float64)
+    rng, nees = np.random.default_rng(1), []
+    for _ in range(TRIALS):
+        at = pose_from_xyt(np.r_[rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3)])
+        truth = pose_from_xyt(np.r_[rng.uniform(-0.15, 0.15, 2), rng.uniform(-0.1, 0.1)])
+        target = simulated.scan(at, walls, beams, sigma_m, rng)
+        source = simulated.scan(at @ truth, walls, beams, sigma_m, rng)
+        result = icp(source, target, truth @ SE2.exp(rng.normal(0, [0.05, 0.05, 0.03])))
+        error = SE2.local(result.T_target_source, truth)
+        nees.append(float(error @ result.information @ error))
+    low, high = chi2.ppf([0.025, 0.975], 3 * TRIALS) / TRIALS
+    assert low < np.mean(nees) < high  # without the noise of the lines' directions 4.2 and 7.0
+
+
+@pytest.mark.parametrize(("beams", "sigma_m"), [(361, 0.02), (1081, 0.01)])
+def test_noise_of_lines_does_not_hold_a_corridor(beams: int, sigma_m: float, simulated: SimpleNamespace) -> None:
+    rng, free = np.random.default_rng(3), []
+    for _ in range(40):
+        at = pose_from_xyt(np.r_[rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3)])
+        truth = pose_from_xyt(np.r_[rng.uniform(-0.15, 0.15, 2), rng.uniform(-0.1, 0.1)])
+        target = simulated.scan(at, simulated.corridor, beams, sigma_m, rng)
+        source = simulated.scan(at @ truth, simulated.corridor, beams, sigma_m, rng)
+        free.append(icp(source, target, truth).degenerate)
+    assert np.mean(free) > 0.9  # 0.75 and 0.47 by J^T W J alone
+
+
 @pytest.mark.parametrize("settings", [IcpSettings.point_to_line(), IcpSettings.point_to_point()], ids=["line", "point"])
 def test_a_corridor_is_free_along_itself(settings: IcpSettings, simulated: SimpleNamespace) -> None:
     rng = np.random.default_rng(2)
