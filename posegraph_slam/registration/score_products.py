@@ -65,37 +65,32 @@ def share_of_source(d: int, k_all: int) -> float:
 
 @kernel
 def fitted_away(
-    d: int, jacobian: FloatArray, scores: FloatArray, weight: FloatArray, variance: FloatArray, covariance: FloatArray,
-    vectors: FloatArray, k_all: int,
+    d: int, jacobian: FloatArray, scores: FloatArray, weight: FloatArray, variance: FloatArray, M: FloatArray,
+    inverse: FloatArray, k_all: int,
 ) -> tuple[FloatArray, float]:  # fmt: skip
-    """What the source's part (p, p) of the scores' covariance lacks, and the factor by which the target's part grows.
+    """What the source's part (p, p) of the scores' covariance M lacks, and the factor by which the target's part grows.
 
     At the estimate distances are smaller than at the truth, by as much as it follows them: the square of each lacks
-    j C j^T, for its row j of the Jacobian and the covariance C (h, h) of the held directions (the leverage of
-    MacKinnon and White 1985, by C itself because neighbours share the noise of their targets).
+    j C j^T, for its row j of the Jacobian and C = D^-1 M D^-1 with `inverse` D^-1 (the leverage of MacKinnon and White
+    1985, by C itself because neighbours share the noise of their targets).
     """
     count, p = jacobian.shape
-    free = p - len(covariance)
-    whole, lacking = np.zeros((p, p)), np.empty(count)
-    whole[free:, free:] = covariance
-    whole = congruent(whole, vectors.T, 0)
-    own, lost, seen = share_of_source(d, k_all), 0.0, 0.0
-    lacking[:] = 0.0
+    C, lacking = congruent(M, inverse, 0) * share_of_source(d, k_all), np.zeros(count)
     for a in range(0, p, 3):
         for b in range(0, p, 3):
-            xx, xy, xz = whole[a, b], whole[a, b + 1], whole[a, b + 2]
-            yx, yy, yz = whole[a + 1, b], whole[a + 1, b + 1], whole[a + 1, b + 2]
-            zx, zy, zz = whole[a + 2, b], whole[a + 2, b + 1], whole[a + 2, b + 2]
+            xx, xy, xz = C[a, b], C[a, b + 1], C[a, b + 2]
+            yx, yy, yz = C[a + 1, b], C[a + 1, b + 1], C[a + 1, b + 2]
+            zx, zy, zz = C[a + 2, b], C[a + 2, b + 1], C[a + 2, b + 2]
             for k in range(count):
                 x, y, z = jacobian[k, b], jacobian[k, b + 1], jacobian[k, b + 2]
-                lacking[k] += own * (
-                    jacobian[k, a] * (xx * x + xy * y + xz * z)
-                    + jacobian[k, a + 1] * (yx * x + yy * y + yz * z)
-                    + jacobian[k, a + 2] * (zx * x + zy * y + zz * z)
-                )
+                u, v, w = jacobian[k, a], jacobian[k, a + 1], jacobian[k, a + 2]
+                lacking[k] += u * (xx * x + xy * y + xz * z) + v * (yx * x + yy * y + yz * z)
+                lacking[k] += w * (zx * x + zy * y + zz * z)
+    lost, seen = 0.0, 0.0
     for k in range(count):
-        lost += weight[k] ** 2 * lacking[k]
-        seen += weight[k] ** 2 * variance[k]
+        square = weight[k] * weight[k]
+        lost += square * lacking[k]
+        seen += square * variance[k]
     return weighted_squares(scores, lacking), 1.0 + lost / max(seen, TINY)
 
 

@@ -45,25 +45,35 @@ def follow_partners(
 
 
 @kernel
-def tilts_of_lines(
-    jacobian: FloatArray, source: FloatArray, s: IntArray, centre: FloatArray, radius: float, thickness: FloatArray,
-    size: FloatArray, k_all: int, t: IntArray, weight: FloatArray,
-) -> FloatArray:  # fmt: skip
-    """Part (3, 3) of J^T W J that is noise of the lines' directions and holds nothing.
+def without_tilts(
+    H: FloatArray, jacobian: FloatArray, source: FloatArray, s: IntArray, centre: FloatArray, radius: float,
+    thickness: FloatArray, size: FloatArray, k_all: int, t: IntArray, weight: FloatArray, bend: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """H (3, 3), which is J^T W J, and the same sum D by curvatures, less what is noise of the lines' directions.
 
     The axis of k points of variances a along and b across it errs by the angle (a b / k)^0.5 / (a - b) (Anderson 1963),
     at most by any at all, and a row of the Jacobian by as much times its derivative. Along a corridor this looks like
     walls across it: at 1081 beams it is over the hundredth of the whole at which a direction counts as held.
     """
-    xx, xy, yy, xt, yt, tt, inverse = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0 / radius
+    hxx, hxy, hyy, hxt, hyt, htt = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    xx, xy, yy, xt, yt, tt = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    inverse, count = 1.0 / radius, float(k_all)
     for k in range(len(t)):
-        at, across, u, v = s[k], thickness[t[k]] ** 2, -jacobian[k, 1], jacobian[k, 0]
-        longer = max(size[k] - across, TINY)
-        tilt = weight[k] * min(size[k] / longer * (across / longer) / k_all, 0.5)
-        turn = ((source[at, 0] - centre[0]) * v - (source[at, 1] - centre[1]) * u) * inverse
-        xx, xy, yy = xx + tilt * u * u, xy + tilt * u * v, yy + tilt * v * v
-        xt, yt, tt = xt + tilt * u * turn, yt + tilt * v * turn, tt + tilt * turn * turn
-    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+        at, across, u, v, turn = s[k], thickness[t[k]], jacobian[k, 0], jacobian[k, 1], jacobian[k, 2]
+        across *= across
+        longer = size[k] - across
+        tilt = min(size[k] * across / (count * longer * longer), 0.5) if longer > 0.0 else 0.5
+        turned = ((source[at, 0] - centre[0]) * u + (source[at, 1] - centre[1]) * v) * inverse
+        vv, uv, uu, vt, ut, square = v * v, u * v, u * u, v * turned, u * turned, turned * turned
+        held, part = bend[k], tilt * bend[k]
+        xx, xy, yy = xx + held * uu - part * vv, xy + (held + part) * uv, yy + held * vv - part * uu
+        xt, yt = xt + held * u * turn + part * vt, yt + held * v * turn - part * ut
+        tt += held * turn * turn - part * square
+        part = tilt * weight[k]
+        hxx, hxy, hyy = hxx + part * vv, hxy - part * uv, hyy + part * uu
+        hxt, hyt, htt = hxt - part * vt, hyt + part * ut, htt + part * square
+    D = np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+    return H - np.array([[hxx, hxy, hxt], [hxy, hyy, hyt], [hxt, hyt, htt]]), D
 
 
 @kernel

@@ -16,7 +16,7 @@ from posegraph_slam.registration.score_products import (
     weighted_squares,
     with_gap,
 )
-from posegraph_slam.registration.score_slope import LEAST_SLOPE, follow_partners, inverse_slope, tilts_of_lines
+from posegraph_slam.registration.score_slope import LEAST_SLOPE, follow_partners, inverse_slope, without_tilts
 from posegraph_slam.registration.selection import middle_of
 from posegraph_slam.registration.small_matrices import TINY, congruent, inverse_of_positive, symmetric_eigen
 from posegraph_slam.registration.small_steps import centre_and_radius, robust_slope, robust_weight
@@ -55,10 +55,10 @@ def describe_pairs(
     lever, size = levers_of(d, gaps, target, anchors, normals, neighbours, t)
     if d == 2:
         follow_partners(offset, weight, target, anchors, normals, thickness, size, neighbours.shape[1], t, bend)
-    D = weighted_squares(jacobian, bend)
-    if d == 2:
-        around = (jacobian, source, s, centre, radius, thickness, size, neighbours.shape[1], t)
-        H, D = H - tilts_of_lines(*around, weight), D - tilts_of_lines(*around, bend)
+        H, D = without_tilts(H, jacobian, source, s, centre, radius, thickness, size, neighbours.shape[1], t, weight,
+                             bend)  # fmt: skip
+    else:
+        D = weighted_squares(jacobian, bend)
     values, vectors = symmetric_eigen(H)
     free = 0
     while free < len(values) and values[free] <= max(ratio * values[len(values) - 1], TINY):
@@ -66,8 +66,8 @@ def describe_pairs(
     sources, targets, near, variance = score_products(d, scores, offset, weight, lever, thickness, target, neighbours,
                                                       t, sigma_floor)  # fmt: skip
     inverse = inverse_slope(congruent(D, vectors, free), values, slope)
-    covariance = congruent(congruent(sources + targets, vectors, free), inverse, 0)
-    fitted, grown = fitted_away(d, jacobian, scores, weight, variance, covariance, vectors, neighbours.shape[1])
+    fitted, grown = fitted_away(d, jacobian, scores, weight, variance, sources + targets,
+                                on_held(inverse, vectors, free), neighbours.shape[1])  # fmt: skip
     M = congruent(sources + fitted + grown * targets, vectors, free)
     least_ratio = 1.0 + SURE * np.sqrt(2.0 * neighbours.shape[1] / max(len(s), 1))
     covariance = congruent(larger_of(M, congruent(near, vectors, free), least_ratio), inverse, 0)
@@ -171,13 +171,29 @@ def weigh_pairs(
     scale = scale_given
     if scale <= 0 or residual != PLANE:
         scale = max(middle_of(length, count) / MEDIAN_1, floor)
-    bent, total = 0.0, 0.0
+    bent, total, factor = 0.0, 0.0, np.empty(count)
     for k in range(count):
-        bend[k] *= robust_slope(loss, length[k] / scale)
-        weight[k] *= robust_weight(loss, length[k] / scale)
+        factor[k] = robust_weight(loss, length[k] / scale)
+    if loss == CAUCHY:  # the usual one: its curvature is (1 - x) / (1 + x)^2 where the weight is 1 / (1 + x)
+        for k in range(count):
+            bend[k] *= factor[k] * (2.0 * factor[k] - 1.0)
+    else:
+        for k in range(count):
+            bend[k] *= robust_slope(loss, length[k] / scale)
+    for k in range(count):
+        weight[k] *= factor[k]
         bent += bend[k]
         total += weight[k]
     return weight, bend, max(bent / max(total, TINY), LEAST_SLOPE)
+
+
+@kernel
+def on_held(inverse: FloatArray, vectors: FloatArray, free: int) -> FloatArray:
+    """Matrix (p, p) that is `inverse` (h, h) on the held eigenvectors and nothing on the free ones."""
+    p = len(vectors)
+    whole = np.zeros((p, p))
+    whole[free:, free:] = inverse
+    return congruent(whole, vectors.T, 0)
 
 
 @kernel
