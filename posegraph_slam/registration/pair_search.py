@@ -7,6 +7,7 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.jit import inline_kernel, kernel
 from posegraph_slam.registration.kd_search import STACK, insert_near, search_near, square_between
+from posegraph_slam.registration.selection import one_by_order
 
 KNOWN = 4
 """Targets that are remembered for a source point: with two, twice as many searches are left (181 beams)."""
@@ -106,7 +107,7 @@ def with_normals(d: int, normals: FloatArray, s: IntArray, t: IntArray, square: 
 def trim(keep: float, s: IntArray, t: IntArray, square: FloatArray, count: int) -> int:
     """Keep the nearest share of the pairs, of equals the first; number of them."""
     wanted = min(max(int(np.round(keep * count)), 1), count)
-    limit = np.partition(square[:count], wanted - 1)[wanted - 1]
+    limit = one_by_order(square, count, wanted)
     nearer = 0
     for k in range(count):
         nearer += square[k] < limit

@@ -107,7 +107,8 @@ def judge_fits(
 ) -> tuple[BoolArray, FloatArray, FloatArray, float]:
     """Oriented, thickness and trust (n,) of what `axes_of_all` fitted, whose anchors move back to the surface.
 
-    Last comes the median thickness of the neighbourhoods over their second longest side, in the plane their length.
+    Last comes the median thickness of the neighbourhoods over their second longest side, in the plane their length;
+    zero where it is no more than `THICKEST_SHARE`.
     """
     n, k = neighbours.shape
     d = points.shape[1]
@@ -115,7 +116,7 @@ def judge_fits(
     if k == 0:
         anchors[:], normals[:] = points, 0.0
         return oriented, thickness, trust, 0.0
-    some, shares, count = np.empty(n), np.empty(n), 0
+    some, shares, count, thin = np.empty(n), np.empty(n), 0, 0
     for row in range(n):
         least, second, largest = variances[row, 0], variances[row, 1], variances[row, 2]
         oriented[row] = second > LINE_TOLERANCE * max(largest, TINY)
@@ -123,6 +124,7 @@ def judge_fits(
         thickness[row] = np.sqrt(least * k / max(k - d, 1))
         if oriented[row]:
             some[count], shares[count] = thickness[row], least / second
+            thin += shares[count] <= THICKEST_SHARE * THICKEST_SHARE
             count += 1
         else:
             for a in range(d):
@@ -136,7 +138,7 @@ def judge_fits(
             if d == 3:
                 trust[row] *= min(LONGEST_SHARE * LONGEST_SHARE * variances[row, 1] / variances[row, 2], 1.0)
     return_to_surface(points, neighbours, anchors, normals, trust)
-    return oriented, thickness, trust, np.sqrt(middle_of(shares, count)) if count > 0 else 0.0
+    return oriented, thickness, trust, 0.0 if 2 * thin > count or count == 0 else np.sqrt(middle_of(shares, count))
 
 
 @kernel
