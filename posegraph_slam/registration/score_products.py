@@ -108,7 +108,7 @@ def spread_scores(
         x, y, z, at = scores[k, a], scores[k, a + 1], scores[k, a + 2], t[k]
         u, v, w = offset[k] * x, offset[k] * y, offset[k] * z
         for j in range(k_all):
-            row, factor = neighbours[at, j], lever[k, j] * thick[k]
+            row, factor = np.uint64(neighbours[at, j]), lever[k, j] * thick[k]  # unsigned: no index counts from the end
             leaning[row, a] += factor * x
             leaning[row, a + 1] += factor * y
             leaning[row, a + 2] += factor * z
