@@ -196,7 +196,8 @@ def search_on(
         start, stop, top = next_leaf(x, y, z, limit, axis, value, top, stack, bounds)
         if start < 0:
             return held
-        for k in range(start, stop):
+        for place in range(start, stop):
+            k = np.uint64(place)  # no index counts from the end: a twentieth of a registration's time
             dx, dy, dz = x - points[k, 0], y - points[k, 1], z - points[k, 2]
             square = dx * dx + dy * dy + dz * dz
             if (square > limit) | ((label[k] >= low) & (label[k] < high)):  # one branch, which is nearly always taken
