@@ -8,7 +8,6 @@ from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import inverse_pose, transform_points
 from posegraph_slam.registration.cloud import Cloud, prepare_cloud
-from posegraph_slam.registration.kd_search import neighbours_of_all
 from posegraph_slam.registration.principal_axes import axes_of_all
 from posegraph_slam.registration.rotation_grid import principal_frame
 from posegraph_slam.registration.scan_lines import LONGEST_SHARE
@@ -50,8 +49,9 @@ def thin_scan_lines(cloud: Cloud) -> Cloud:
     shape, reach = shape_of_neighbourhoods(cloud)
     if shape <= LONGEST_SHARE:
         return cloud
-    thinned, voxel_m, frame = cloud, reach / 2, principal_frame(cloud.points)
+    thinned, frame = cloud, principal_frame(cloud.points)
     framed = transform_points(inverse_pose(frame), cloud.points)
+    voxel_m = max(reach / 2, float(np.ptp(framed, axis=0).max()) / 2 ** (AXIS_BITS - 1))
     while shape > EVEN_SHARE:
         coarser = transform_points(frame, downsample(framed, voxel_m))
         if len(coarser) < FEWEST:
@@ -64,8 +64,7 @@ def thin_scan_lines(cloud: Cloud) -> Cloud:
 
 def shape_of_neighbourhoods(cloud: Cloud) -> tuple[float, float]:
     """Median length over width of the neighbourhoods of all points (n, 3), and the median of their reach."""
-    tree = cloud.tree
-    index = neighbours_of_all(tree.rows, tree.sorted_points, tree.axis, tree.value, cloud.neighbours)
+    index = cloud.tree.neighbours_of_all(cloud.neighbours)
     _, _, variances = axes_of_all(cloud.points, index)
     reach = np.linalg.norm(cloud.points[index[:, -1]] - cloud.points, axis=1)
     return float(np.sqrt(np.median(variances[:, 2] / np.maximum(variances[:, 1], TINY)))), float(np.median(reach))

@@ -7,7 +7,6 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.geometry import inverse_pose, transform_points
 from posegraph_slam.jit import kernel
-from posegraph_slam.registration.kd_search import nearest_several
 from posegraph_slam.registration.kd_tree import build_kd_tree
 from posegraph_slam.registration.principal_axes import axes_of_all
 from posegraph_slam.registration.rotation_grid import principal_frame
@@ -45,8 +44,7 @@ def widen_rows(
         part = part[one_a_voxel(framed[part], voxel_m)]
         if len(rows) == 0 or len(part) < k:
             break
-        tree = build_kd_tree(points[part])
-        found = part[nearest_several(points[rows], tree.rows, tree.sorted_points, tree.axis, tree.value, k)]
+        found = part[build_kd_tree(points[part]).neighbours(points[rows], k)]
         middle, across, spread = axes_of_all(points, found)
         wide = spread[:, 2] <= LONGEST_SHARE**2 * spread[:, 1]
         settled = rows[wide]

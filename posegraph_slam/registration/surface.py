@@ -68,7 +68,7 @@ def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
         return Surface(anchors=frozen(anchors), normals=frozen(normals), normals_in_space=frozen(spread),
                        oriented=frozen(oriented), thickness_m=frozen(thickness), trust=frozen(trust),
                        neighbours=frozen(index), nearest=frozen(index))  # fmt: skip
-    index = neighbours_of_all(tree.rows, tree.sorted_points, tree.axis, tree.value, count)
+    index = tree.neighbours_of_all(count)
     anchors, normals, variances = axes_of_all(points, index)
     support = widen_rows(points, index, anchors, normals, variances)
     oriented, thickness, trust, _ = judge_fits(points, support, anchors, normals, variances)

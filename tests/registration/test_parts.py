@@ -76,6 +76,8 @@ def test_dense_scan_lines_are_thinned_until_they_are_even() -> None:
     assert len(np.unique(np.round(thinned.points[:, 1] / 0.15))) == 40  # all lines are left
     assert 3000 < len(thinned) < 8000
     assert shape_of_neighbourhoods(thinned)[0] <= EVEN_SHARE
+    lost = np.vstack([points, [[3e6, 0.0, 0.0]]])
+    assert len(thin_scan_lines(prepare_cloud(lost))) <= len(lost)  # a far outlier leaves the grid in its bounds
     for few_or_even in (prepare_cloud(points[::40]), prepare_cloud(rng.uniform(0, 1, (3000, 3)) * [6, 6, 0.01]),
                         prepare_cloud(points[:, :2])):  # fmt: skip
         assert thin_scan_lines(few_or_even) is few_or_even
