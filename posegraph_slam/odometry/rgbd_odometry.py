@@ -13,7 +13,13 @@ from posegraph_slam.errors import InputError
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress, split_range
 from posegraph_slam.geometry import SE3, Trajectory, interpolate
 from posegraph_slam.registration.feature_motion import motion_of_matches
-from posegraph_slam.registration.features import Features, detect_features, match_features
+from posegraph_slam.registration.features import (
+    FEATURES,
+    MANY_FEATURES,
+    Features,
+    detect_features,
+    match_features,
+)
 from posegraph_slam.registration.rgbd_alignment import RgbdAlignment, RgbdAlignmentSettings, align_frames
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, RgbdReference, prepare_reference
 from posegraph_slam.settings import Settings
@@ -86,7 +92,8 @@ class _Tracker:
     step: FloatArray
     """Motion of the camera from frame to frame, for prediction."""
     T_key_last: FloatArray
-    features: Features | None = None
+    features: dict[int, Features] = field(default_factory=dict)
+    """Of the keyframe, by how many were looked for."""
     keyframes: list[int] = field(default_factory=list)
     motions: list[FloatArray] = field(default_factory=list)
     information: list[FloatArray] = field(default_factory=list)
@@ -112,20 +119,22 @@ class _Tracker:
         moved = SE3.between(self.T_key_last, found.T_target_source)
         if found.usable and not self.leaps(moved, self.settings.leap_turn_rad, self.settings.leap_shift):
             return found
-        by_features = self.align_features(frame)
-        if by_features is None:
-            return found
-        return by_features if fit_score(by_features) > fit_score(found) else found
+        for most in (FEATURES, MANY_FEATURES):
+            by_features = self.align_features(frame, most)
+            if by_features is not None and fit_score(by_features) > fit_score(found):
+                found = by_features
+            if found.usable:
+                break
+        return found
 
-    def align_features(self, frame: RgbdFrame) -> RgbdAlignment | None:
-        """Align a frame from the motion of its features, None where too few agree."""
-        if self.features is None:
-            self.features = features_of(self.reference.frame)
-        source = features_of(frame)
+    def align_features(self, frame: RgbdFrame, most: int) -> RgbdAlignment | None:
+        """Align a frame from the motion of up to `most` features, None where too few agree."""
+        if most not in self.features:
+            self.features[most] = features_of(self.reference.frame, most)
+        target, source = self.features[most], features_of(frame, most)
         motion = motion_of_matches(
-            self.features, source, match_features(self.features, source),
-            inliers_min=self.settings.features_min, seed=self.seed,
-        )  # fmt: skip
+            target, source, match_features(target, source), inliers_min=self.settings.features_min, seed=self.seed
+        )
         if not motion.found:
             return None
         return align_frames(self.reference, frame, motion.T_target_source, self.settings.alignment)
@@ -158,7 +167,7 @@ class _Tracker:
         self.motions.append(T)
         self.information.append(information)
         self.guessed.append(guessed)
-        self.key, self.reference, self.features = self.last, reference, None
+        self.key, self.reference, self.features = self.last, reference, {}
         self.keyframes.append(self.key)
         self.T_key_last = np.eye(4)
 
@@ -177,9 +186,9 @@ def fit_score(found: RgbdAlignment) -> float:
     return 2.0 * found.usable + found.agreement * found.inlier_fraction * max(found.correlation, 0.0)
 
 
-def features_of(frame: RgbdFrame) -> Features:
-    """Detect the features of a frame at full resolution."""
-    return detect_features(frame.intensity[0], frame.depth[0], frame.camera[0])
+def features_of(frame: RgbdFrame, most: int) -> Features:
+    """Detect up to `most` features of a frame at full resolution."""
+    return detect_features(frame.intensity[0], frame.depth[0], frame.camera[0], most=most)
 
 
 def track_rgbd(

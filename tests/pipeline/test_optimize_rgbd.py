@@ -141,6 +141,20 @@ def test_five_frames_far_apart_are_placed(psg_data: Path) -> None:
 
 
 @pytest.mark.data
+def test_wide_steps_are_found_in_half_of_the_depth(psg_data: Path) -> None:
+    """The usual number of features finds the first of these steps only with depths beyond 7 m."""
+    robot_log = read(psg_data / "rgbd/five_frames")
+    overrides = [*FIVE_FRAMES, "maps=false", "rgbd.max_depth_m=5"]
+    result = optimize_rgbd(robot_log, load_configuration(["default"], overrides))
+    assert robot_log.truth is not None
+    assert result.odometry.tracked.all()
+    truth, poses = robot_log.truth.poses, result.stages["odometry"].poses
+    steps = SE3.inverse(SE3.between(truth[:-1], truth[1:])) @ SE3.between(poses[:-1], poses[1:])
+    assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.03
+    assert np.rad2deg(Rotation.from_matrix(steps[:, :3, :3]).magnitude()).max() < 1.0
+
+
+@pytest.mark.data
 def test_part_of_the_living_room_is_consistent(psg_data: Path, tmp_path: Path) -> None:
     """Every sixth frame of the first half: out to one side and back over the start."""
     source, folder = psg_data / "rgbd/living_room", tmp_path / "living_room"
