@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.datasets.image_headers import ImageHeader, read_image_header
 from posegraph_slam.datasets.number_text import read_table
 from posegraph_slam.datasets.rgbd_camera import (
@@ -26,6 +27,7 @@ from posegraph_slam.sensors import RgbdSequence, RobotLog
 COLOUR_FOLDERS, DEPTH_FOLDERS = ("rgb", "color", "colour", "image", "images"), ("depth", "depths")
 COLOUR_SUFFIXES, DEPTH_SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm"), (".png", ".pgm")
 TRUTH_FILES = ("groundtruth.txt", "truth.tum", "pose.txt", "poses.txt", "trajectory.txt", "traj.txt")
+ASSOCIATION_FILES = ("associations.txt", "associated.txt", "association.txt", "assoc.txt")
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 TUM_GAP_S = 0.02
 """Colour and depth frames further apart in time are not paired; the benchmark's own tool takes the same."""
@@ -38,7 +40,7 @@ def detects(path: Path) -> bool:
     """Whether `path` is a folder with lists of colour and depth files, or with a folder of each."""
     if not path.is_dir():
         return False
-    if (path / "rgb.txt").is_file() and (path / "depth.txt").is_file():
+    if _associations(path) is not None or ((path / "rgb.txt").is_file() and (path / "depth.txt").is_file()):
         return True
     return _subfolder(path, COLOUR_FOLDERS) is not None and _subfolder(path, DEPTH_FOLDERS) is not None
 
@@ -50,8 +52,14 @@ def read(path: Path) -> RobotLog:
     16 bits, and files that cannot be read.
     """
     remarks: list[str] = []
-    tum = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
-    colour, depth, stamps = _listed_pairs(path, remarks) if tum else _numbered_pairs(path, remarks)
+    associations, tum = _associations(path), True
+    if associations is not None:
+        colour, depth, stamps = _associated_pairs(associations, remarks)
+    elif (path / "rgb.txt").is_file() and (path / "depth.txt").is_file():
+        colour, depth, stamps = _listed_pairs(path, remarks)
+    else:
+        colour, depth, stamps = _numbered_pairs(path, remarks)
+        tum = False
     header = _checked_headers(colour, depth)
     file = find_camera_file(path)
     if file is None:
@@ -66,6 +74,11 @@ def read(path: Path) -> RobotLog:
     return RobotLog(path=path, format="rgbd", rgbd_sequence=sequence, truth=truth, remarks=tuple(remarks))
 
 
+def _associations(path: Path) -> Path | None:
+    """The list of pairs in the folder, under one of its customary names."""
+    return next((path / name for name in ASSOCIATION_FILES if (path / name).is_file()), None)
+
+
 def _subfolder(path: Path, names: tuple[str, ...]) -> Path | None:
     """The subfolder with the first of the customary names, in any case."""
     by_name = {entry.name.lower(): entry for entry in sorted(path.iterdir()) if entry.is_dir()}
@@ -73,44 +86,86 @@ def _subfolder(path: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _listed_pairs(path: Path, remarks: list[str]) -> _Pairs:
-    """Pair the frames of rgb.txt and depth.txt (a stamp and a file a line), nearest in time, each used once."""
+    """Pair the frames of rgb.txt and depth.txt (a stamp and a file a line) by time, each used once."""
     colour_s, colour = _read_list(path / "rgb.txt")
     depth_s, depth = _read_list(path / "depth.txt")
-    order = np.argsort(depth_s, kind="stable")
-    after = np.clip(np.searchsorted(depth_s[order], colour_s), 1, max(len(depth_s) - 1, 1))
-    before, after = order[after - 1], order[np.minimum(after, len(depth_s) - 1)]
-    nearest = np.where(np.abs(colour_s - depth_s[before]) <= np.abs(depth_s[after] - colour_s), before, after)
-    gap = np.abs(colour_s - depth_s[nearest])
-    chosen = dict[int, int]()
-    for c in np.lexsort((np.arange(len(gap)), gap)):  # closest pairs first, so that none loses its partner to a worse
-        if gap[c] <= TUM_GAP_S and int(nearest[c]) not in chosen:
-            chosen[int(nearest[c])] = int(c)
-    pairs = sorted((c, d) for d, c in chosen.items())
-    if not pairs:
+    pairs = nearest_pairs(colour_s, depth_s, TUM_GAP_S)
+    if len(pairs) == 0:
         raise InputError(path, f"no colour and depth frames lie within {TUM_GAP_S:g} s", "check rgb.txt and depth.txt")
     left = len(colour) - len(pairs)
     if left:
         remarks.append(f"{left} of {len(colour)} colour frames have no depth frame within {TUM_GAP_S:g} s: left out")
-    stamps = np.array([colour_s[c] for c, _ in pairs])
-    return [colour[c] for c, _ in pairs], [depth[d] for _, d in pairs], stamps
+    return [colour[c] for c in pairs[:, 0]], [depth[d] for d in pairs[:, 1]], colour_s[pairs[:, 0]]
+
+
+def nearest_pairs(a_s: FloatArray, b_s: FloatArray, gap_s: float) -> IntArray:
+    """Pair stamps a (n,) and b (m,) no further apart than `gap_s`: rows (k, 2) in the order of a, each stamp used once.
+
+    Of all pairs the closest is taken first, then the closest of what is left, as the benchmark's own tool does: a frame
+    whose nearest partner belongs to another gets its second nearest.
+    """
+    order = np.argsort(b_s, kind="stable")
+    low = np.searchsorted(b_s[order], a_s - gap_s, side="left")
+    count = np.searchsorted(b_s[order], a_s + gap_s, side="right") - low
+    rows = np.repeat(np.arange(len(a_s)), count)
+    columns = order[np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)]
+    partner, taken = dict[int, int](), set[int]()
+    for k in np.lexsort((columns, rows, np.abs(a_s[rows] - b_s[columns]))).tolist():
+        a, b = int(rows[k]), int(columns[k])
+        if a not in partner and b not in taken:
+            partner[a] = b
+            taken.add(b)
+    return np.array(sorted(partner.items()), dtype=np.int64).reshape(-1, 2)
+
+
+def _associated_pairs(file: Path, remarks: list[str]) -> _Pairs:
+    """Read pairs from a list: stamp and file of colour and of depth, or the other way round, a line."""
+    first_s, first, second_s, second = list[float](), list[Path](), list[float](), list[Path]()
+    for number, words in _lines(file):
+        try:
+            stamps, names = (float(words[0]), float(words[2])), (words[1], words[3])
+        except (ValueError, IndexError):
+            raise InputError(f"{file}:{number}", "is not two pairs of a stamp and a file", "correct the line") from None
+        first.append(_listed_file(file, number, names[0]))
+        second.append(_listed_file(file, number, names[1]))
+        first_s.append(stamps[0])
+        second_s.append(stamps[1])
+    if not first:
+        raise InputError(file, "lists no frame", "give a stamp and a file name, twice a line")
+    remarks.append(f"{len(first)} pairs of colour and depth from {file.name}")
+    depth_first = read_image_header(first[0]).bits == 16 and read_image_header(second[0]).bits != 16
+    if depth_first:
+        return second, first, np.array(second_s)
+    return first, second, np.array(first_s)
+
+
+def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Words of every line that is neither blank nor a comment, with its number."""
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            yield number, words
+
+
+def _listed_file(list_file: Path, number: int, name: str) -> Path:
+    frame = list_file.parent / name
+    if not frame.is_file():
+        raise InputError(
+            f"{list_file}:{number}", f"names {name}, which is missing", "copy the file, or remove the line"
+        )
+    return frame
 
 
 def _read_list(file: Path) -> tuple[FloatArray, list[Path]]:
     stamps, paths = list[float](), list[Path]()
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
+    for number, words in _lines(file):
         try:
             stamp = float(words[0])
             name = words[1]
         except (ValueError, IndexError):
             raise InputError(f"{file}:{number}", "is not a stamp and a file name", "correct the line") from None
-        frame = file.parent / name
-        if not frame.is_file():
-            raise InputError(f"{file}:{number}", f"names {name}, which is missing", "copy the file, or remove the line")
+        paths.append(_listed_file(file, number, name))
         stamps.append(stamp)
-        paths.append(frame)
     if not stamps:
         raise InputError(file, "lists no frame", "give a stamp and a file name a line")
     return np.array(stamps), paths

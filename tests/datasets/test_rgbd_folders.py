@@ -12,6 +12,7 @@ import pytest
 
 from posegraph_slam import datasets
 from posegraph_slam.datasets.image_headers import read_image_header
+from posegraph_slam.datasets.rgbd import nearest_pairs
 from posegraph_slam.datasets.rgbd_camera import read_camera
 from posegraph_slam.errors import InputError
 
@@ -82,6 +83,48 @@ def test_pairs_the_lists_of_the_tum_benchmark_by_time(tmp_path: Path) -> None:
     assert sequence.camera.depth_units_per_m == 5000
     assert sequence.camera.fx_px == pytest.approx(517.3 / 16)
     assert any("1 of 4 colour frames" in remark for remark in log.remarks)
+
+
+@pytest.mark.parametrize("gap_s", [0.02, 0.05])
+def test_pairs_as_many_frames_as_trying_all_pairs_does(gap_s: float) -> None:
+    rng = np.random.default_rng(4)
+    a = np.arange(60) / 30 + rng.uniform(0, 0.01, 60)
+    b = np.delete(np.arange(60) / 30 + 0.014 + rng.uniform(0, 0.01, 60), [7, 8, 30])
+    rng.shuffle(b)
+    # the rule of the benchmark's tool, written down plainly
+    every = sorted((abs(s - t), i, j) for i, s in enumerate(a) for j, t in enumerate(b) if abs(s - t) <= gap_s)
+    expected = dict[int, int]()
+    for _, i, j in every:
+        if i not in expected and j not in expected.values():
+            expected[i] = j
+    np.testing.assert_array_equal(nearest_pairs(a, b, gap_s), sorted(expected.items()))
+    assert len(nearest_pairs(a, b, 1e-6)) == 0
+
+
+def test_a_list_of_pairs_goes_before_two_lists(tmp_path: Path) -> None:
+    folder = tum_folder(tmp_path / "log")
+    rgb, depth = sorted((folder / "rgb").iterdir()), sorted((folder / "depth").iterdir())
+    chosen = [(3, 0), (2, 1)]
+    for depth_first in (False, True):
+        lines = []
+        for c, d in chosen:
+            words = [f"{rgb[c].stem} rgb/{rgb[c].name}", f"{depth[d].stem} depth/{depth[d].name}"]
+            lines.append(" ".join(reversed(words) if depth_first else words))
+        (folder / "associations.txt").write_text("# pairs\n" + "\n".join(lines) + "\n")
+        sequence = datasets.read(folder).rgbd_sequence
+        assert sequence is not None
+        assert sequence.colour_files == (rgb[3], rgb[2])
+        assert sequence.depth_files == (depth[0], depth[1])
+        assert sequence.camera.depth_units_per_m == 5000
+        np.testing.assert_allclose(sequence.stamps_s, [float(rgb[3].stem), float(rgb[2].stem)], atol=1e-9)
+    (folder / "rgb.txt").unlink()
+    assert datasets.read(folder).rgbd_sequence is not None
+    (folder / "associations.txt").write_text("1.0 rgb/none.png 1.0 depth/none.png\n")
+    with pytest.raises(InputError, match=r"associations.txt:1.*missing"):
+        datasets.read(folder)
+    (folder / "associations.txt").write_text("1.0 rgb/none.png\n")
+    with pytest.raises(InputError, match="two pairs of a stamp and a file"):
+        datasets.read(folder)
 
 
 def test_takes_poses_without_stamps_as_truth(tmp_path: Path) -> None:
