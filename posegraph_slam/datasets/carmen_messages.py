@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from posegraph_slam.arrays import Float32Array, FloatArray, IntArray, read_only
+from posegraph_slam.arrays import Float32Array, FloatArray, IntArray, in_range, range_fault, read_only, single
 from posegraph_slam.datasets.number_text import parse_numbers
 from posegraph_slam.errors import InputError
 
@@ -143,7 +143,7 @@ def _assemble(path: Path, name: bytes, parts: list[tuple[IntArray, FloatArray]],
     return ScanMessages(
         line_numbers=numbers[order],
         stamps_s=others[:, -1],
-        ranges_m=columns(slice(head + 1, head + 1 + beams)).astype(np.float32),
+        ranges_m=single(columns(slice(head + 1, head + 1 + beams))),
         laser_xyt=others[:, 0:3],
         robot_xyt=others[:, 3:6],
         configuration=configuration,
@@ -221,7 +221,8 @@ def _is_whole(name: bytes, line: bytes) -> bool:
 
 
 def _refuse_not_finite(path: Path, values: FloatArray, numbers: IntArray) -> None:
-    bad = ~np.isfinite(values).all(axis=1)
+    bad = ~in_range(values).all(axis=1)
     if bad.any():
-        where = f"{path}:{numbers[int(np.argmax(bad))]}"
-        raise InputError(where, "holds a pose or stamp that is not finite", "correct or remove the line")
+        row = int(np.argmax(bad))
+        problem = f"holds a pose or stamp that is {range_fault(values[row])}"
+        raise InputError(f"{path}:{numbers[row]}", problem, "correct or remove the line")

@@ -5,23 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from posegraph_slam.arrays import FloatArray
-from posegraph_slam.datasets.number_text import parse_numbers
+from posegraph_slam.datasets.number_text import numbered_lines, parse_numbers
 from posegraph_slam.errors import InputError
 
 
 def read_csv(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[int]]:
     """Read the first `columns` of a comma-separated table into values (N, C) and the line number of each row.
 
-    Comments (#), blank lines and a first line of words are skipped; further columns are left out. Raises `InputError`
-    naming the line where columns are missing or something is not a number.
+    Comments (#), blank lines and a first line without any number are skipped; further columns are left out. Raises
+    `InputError` naming the line where columns are missing or something is not a number.
     """
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the path") from error
-    rows = [(number, line.strip()) for number, line in enumerate(lines, 1)]
-    rows = [(number, line) for number, line in rows if line and not line.startswith(b"#")]
-    if rows and not _numbers(rows[0][1], len(columns)) and not any(mark.isdigit() for mark in rows[0][1][:1].decode()):
+    rows = numbered_lines(path)
+    if rows and not any(map(_is_number, rows[0][1].split(b","))):
         rows = rows[1:]
     if not rows:
         raise InputError(path, "holds no row", f"expected the columns {', '.join(columns)}")
@@ -43,3 +38,11 @@ def _numbers(line: bytes, count: int) -> bytes | None:
         return text if len(cells) == count and len(parse_numbers(text)) == count else None
     except ValueError:
         return None
+
+
+def _is_number(cell: bytes) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

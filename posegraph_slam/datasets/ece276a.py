@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.arrays import FloatArray, read_only
+from posegraph_slam.arrays import FloatArray, in_range, read_only, single
 from posegraph_slam.datasets.coverage import uneven_coverage
 from posegraph_slam.datasets.ece276a_frames import find_frames
 from posegraph_slam.datasets.npz import Archive
@@ -28,6 +28,8 @@ TRACK_WIDTH_M = 0.75
 
 Run 20 against its gyro gives 0.754 m and against its LiDAR path 0.748 m (least squares over turns of 1 to 5 s).
 """
+TICKS_MAX = 1e9
+"""Between two stamps: two thousand kilometres, as an overflown counter gives."""
 T_BASE_LIDAR = read_only(pose_from_rotation_translation(np.eye(3), np.array([0.133, 0.0, 0.514])))
 T_BASE_CAMERA = read_only(
     pose_from_rotation_translation(
@@ -104,6 +106,10 @@ def _encoders(archive: Archive) -> WheelEncoders:
     if np.abs(counts - whole).max() > 1e-6:
         index = int(np.argmax(np.abs(counts - whole).max(axis=0)))
         raise InputError(archive.path, f"field 'counts' at index {index} is not a whole number of ticks")
+    if np.abs(whole).max() > TICKS_MAX:
+        index = int(np.argmax(np.abs(whole).max(axis=0)))
+        problem = f"field 'counts' at index {index} is {whole[np.abs(whole[:, index]).argmax(), index]:g} ticks"
+        raise InputError(archive.path, problem, "counts are ticks since the last stamp: repair the log")
     ticks = whole.astype(np.int64)
     return WheelEncoders(
         stamps_s=stamps,
@@ -139,7 +145,7 @@ def _scans(archive: Archive, remarks: list[str]) -> LaserScans:
         raise InputError(archive.path, problem, "check ranges (beams, scans) and the angles")
     if not 0 <= nearest < farthest:
         raise InputError(archive.path, f"range_min {nearest:g} and range_max {farthest:g} leave no range to use")
-    ranges_m = np.ascontiguousarray(ranges.T, dtype=np.float32)
+    ranges_m = single(ranges.T)
     missing = int(np.count_nonzero(~np.isfinite(ranges_m)))
     if missing:
         remarks.append(f"{missing} of {ranges_m.size} ranges are NaN or infinite and count as no return")
@@ -156,7 +162,7 @@ def _scans(archive: Archive, remarks: list[str]) -> LaserScans:
 
 def _mounting(archive: Archive) -> FloatArray:
     T = np.asarray(archive.numbers("T_base_lidar"), dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+    if T.shape != (4, 4) or not in_range(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
         raise InputError(archive.path, f"field 'T_base_lidar' {T.shape} is no pose", "give a 4 x 4 transform, or none")
     return T
 

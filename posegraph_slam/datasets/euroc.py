@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, in_range
 from posegraph_slam.datasets.csv_table import read_csv
-from posegraph_slam.datasets.number_text import refuse_first
+from posegraph_slam.datasets.number_text import refuse_first, require_in_range
 from posegraph_slam.datasets.trajectory_files import read_trajectory
 from posegraph_slam.errors import InputError
 from posegraph_slam.sensors import Imu, RobotLog
@@ -40,7 +40,7 @@ def read(path: str | Path) -> RobotLog:
     if not file.is_file():
         raise InputError(path, f"has no {IMU}/data.csv", "give the folder that holds mav0, or mav0 itself")
     values, numbers = read_csv(file, COLUMNS)
-    refuse_first(~np.isfinite(values).all(axis=1), file, numbers, "holds a value that is not finite")
+    require_in_range(values, file, numbers)
     truth = file.parent.parent / TRUTH / "data.csv"
     stamps = values[:, 0] / 1e9
     refuse_first(np.diff(stamps, prepend=stamps[:1]) < 0, file, numbers, "the clock runs backwards")
@@ -74,6 +74,6 @@ def _mounting(file: Path) -> FloatArray:
         T = np.array([float(word) for word in found[1].replace(",", " ").split()]).reshape(4, 4) if found else None
     except ValueError:
         T = None
-    if T is None or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
+    if T is None or not in_range(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
         raise InputError(file, "holds no pose T_BS of 4 x 4 numbers", "correct it, or remove the file for the identity")
     return T

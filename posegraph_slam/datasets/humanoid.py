@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, in_range, single
 from posegraph_slam.datasets.coverage import uneven_coverage
 from posegraph_slam.datasets.humanoid_lidar import read_lidar
-from posegraph_slam.datasets.matlab import load_mat, require
+from posegraph_slam.datasets.matlab import load_mat, numbers, require
 from posegraph_slam.datasets.tum import read_tum
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
@@ -61,7 +61,7 @@ def read(path: str | Path) -> RobotLog:
     T_base_lidar = lidar_on_level_body(joints.neck_yaw_rad[index], joints.head_pitch_rad[index], tilt[:, 0], tilt[:, 1])
     angles = records.resolution_rad * (np.arange(ranges.shape[1]) - (ranges.shape[1] - 1) / 2)
     levelled = level_ranges(
-        ranges.astype(np.float32),
+        single(ranges),
         angles,
         T_base_lidar,
         heights_m=(GROUND_M, np.inf),
@@ -117,12 +117,12 @@ def read_joints(path: str | Path) -> JointAngles:
     """
     path = Path(path)
     content = load_mat(path)
-    stamps = np.asarray(require(content, "ts", path), dtype=np.float64).reshape(-1)
-    angles = np.asarray(require(content, "head_angles", path), dtype=np.float64)
+    stamps = numbers(require(content, "ts", path), "ts", path).reshape(-1)
+    angles = numbers(require(content, "head_angles", path), "head_angles", path)
     if angles.shape != (2, len(stamps)) or len(stamps) == 0:
         raise InputError(path, f"field 'head_angles' has shape {angles.shape}", f"expected (2, {len(stamps)})")
-    if not np.isfinite(angles).all() or not np.isfinite(stamps).all():
-        raise InputError(path, "holds angles or stamps that are not finite", "repair the log")
+    if not in_range(angles).all() or not in_range(stamps).all():
+        raise InputError(path, "holds angles or stamps that are not finite, or far too large", "repair the log")
     if (np.diff(stamps) < 0).any():
         raise InputError(path, f"the clock in 'ts' runs backwards at index {int(np.argmax(np.diff(stamps) < 0)) + 1}")
     return JointAngles(stamps_s=stamps, neck_yaw_rad=angles[0], head_pitch_rad=angles[1])

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from posegraph_slam.arrays import FloatArray, read_only
-from posegraph_slam.datasets.matlab import load_mat, require
+from posegraph_slam.arrays import FloatArray, in_range, range_fault, read_only
+from posegraph_slam.datasets.matlab import load_mat, numbers, require
 from posegraph_slam.errors import InputError
 
 POSES, STEPS = ("t", "pose", "res", "rpy", "scan"), ("t", "scan", "delta_pose")
@@ -88,14 +88,14 @@ def _stacked(path: Path, cells: npt.NDArray[Any], name: str, stored: str) -> Flo
         if stored not in (getattr(getattr(record, "dtype", None), "names", None) or ()):
             wanted = f"a scan holds {', '.join(POSES)}, or {', '.join(STEPS)}"
             raise InputError(path, f"scan {number} has no field '{stored}'", wanted)
-        rows.append(np.asarray(record[stored], dtype=np.float64).reshape(-1))
+        rows.append(numbers(record[stored], stored, path).reshape(-1))
     sizes, wanted_size = {len(row) for row in rows}, SIZES.get(name)
     if len(sizes) != 1 or wanted_size not in (None, *sizes) or sizes == {0}:
         raise InputError(
             path, f"field '{name}' has {sorted(sizes)} values", f"expected {wanted_size or 'one number of beams'}"
         )
     values = np.stack(rows)
-    if name != "scan" and not np.isfinite(values).all():
-        bad = int(np.argmax(~np.isfinite(values).all(axis=1)))
-        raise InputError(path, f"field '{name}' of scan {bad} is not finite", "repair the log")
+    if name != "scan" and not in_range(values).all():
+        bad = int(np.argmax(~in_range(values).all(axis=1)))
+        raise InputError(path, f"field '{name}' of scan {bad} is {range_fault(values[bad])}", "repair the log")
     return values

@@ -6,9 +6,11 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from posegraph_slam.arrays import FloatArray
 from posegraph_slam.errors import InputError
 
 UNREADABLE = (
@@ -42,3 +44,11 @@ def require(content: dict[str, Any], name: str, path: Path) -> Any:
     if name not in content:
         raise InputError(path, f"has no field '{name}'", f"it holds {', '.join(content) or 'nothing'}")
     return content[name]
+
+
+def numbers(value: Any, name: str, path: Path) -> FloatArray:
+    """Return a variable or field as float64 of any shape; raise InputError naming it where it holds no numbers."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise InputError(path, f"field '{name}' holds {array.dtype}, not numbers", "store it as a numeric array")
+    return np.asarray(array, dtype=np.float64)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, in_range, range_fault
 from posegraph_slam.errors import InputError
 
 UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError, NotImplementedError)
@@ -44,7 +44,7 @@ class Archive:
     def scalar(self, name: str) -> float:
         """Return a field of one finite number, stored with any number of dimensions."""
         field = self.numbers(name)
-        if field.size != 1 or not np.isfinite(field).all():
+        if field.size != 1 or not in_range(field).all():
             raise InputError(self.path, f"field '{name}' {field.shape} is not one finite number")
         return float(field.reshape(-1)[0])
 
@@ -55,9 +55,7 @@ class Archive:
             stamps = stamps.reshape(-1)
         if stamps.ndim != 1 or not stamps.size:
             raise InputError(self.path, f"field '{name}' has shape {stamps.shape}", "expected (samples,), not empty")
-        bad = ~np.isfinite(stamps)
-        if bad.any():
-            raise InputError(self.path, f"field '{name}' is not finite at index {int(np.argmax(bad))}")
+        self._require_in_range(name, stamps)
         back = np.diff(stamps) < 0
         if back.any():
             k = int(np.argmax(back))
@@ -80,10 +78,15 @@ class Archive:
     def finite_samples(self, name: str, rows: int, stamps_s: FloatArray) -> FloatArray:
         """Return a field (rows, N) without NaN or infinity as float64."""
         field = np.asarray(self.samples(name, rows, stamps_s), dtype=np.float64)
-        bad = ~np.isfinite(field).all(axis=0)
-        if bad.any():
-            raise InputError(self.path, f"field '{name}' is not finite at index {int(np.argmax(bad))}")
+        self._require_in_range(name, field)
         return field
+
+    def _require_in_range(self, name: str, values: FloatArray) -> None:
+        """Refuse values (..., N) that are not finite or far too large, naming the first index of the last axis."""
+        bad = ~in_range(values).reshape(-1, values.shape[-1]).all(axis=0)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise InputError(self.path, f"field '{name}' is {range_fault(values[..., k])} at index {k}")
 
 
 def _first_line(error: BaseException) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.datasets.number_text import read_table, refuse_first
+from posegraph_slam.datasets.number_text import read_table, require_in_range
 from posegraph_slam.files import replacing
 from posegraph_slam.geometry import Relations, pose_from_rotation_translation
 
@@ -22,7 +22,7 @@ def read_relations(path: str | Path) -> Relations:
     """
     path = Path(path)
     values, numbers = read_table(path, COLUMNS)
-    refuse_first(~np.isfinite(values).all(axis=1), path, numbers, "holds a value that is not finite")
+    require_in_range(values, path, numbers)
     R = Rotation.from_euler("xyz", values[:, 5:]).as_matrix()
     return Relations(
         stamps_1_s=values[:, 0], stamps_2_s=values[:, 1], T_1_2=pose_from_rotation_translation(R, values[:, 2:5])

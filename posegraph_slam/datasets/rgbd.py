@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.arrays import FloatArray, IntArray, in_range, range_fault
 from posegraph_slam.datasets.image_headers import ImageHeader, read_image_header
-from posegraph_slam.datasets.number_text import read_table
+from posegraph_slam.datasets.number_text import read_table, refuse_first, require_in_range
 from posegraph_slam.datasets.rgbd_camera import (
     DEPTH_UNITS_PER_M,
     TUM_DEPTH_UNITS_PER_M,
@@ -164,6 +164,8 @@ def _read_list(file: Path) -> tuple[FloatArray, list[Path]]:
             name = words[1]
         except (ValueError, IndexError):
             raise InputError(f"{file}:{number}", "is not a stamp and a file name", "correct the line") from None
+        if not in_range(stamp):
+            raise InputError(f"{file}:{number}", f"its stamp is {range_fault(stamp)}", "correct the line")
         paths.append(_listed_file(file, number, name))
         stamps.append(stamp)
     if not stamps:
@@ -251,7 +253,9 @@ def _truth(path: Path, stamps: FloatArray) -> Trajectory | None:
         width = next((len(line.split()) for line in lines if line.strip() and not line.startswith("#")), 0)
     if width != len(POSE_COLUMNS):
         return read_tum(file, parent="ref", child="camera")
-    values, _ = read_table(file, POSE_COLUMNS)
+    values, numbers = read_table(file, POSE_COLUMNS)
+    require_in_range(values, file, numbers)
+    refuse_first(np.linalg.norm(values[:, 3:], axis=1) < 1e-6, file, numbers, "holds a zero quaternion")
     if len(values) != len(stamps):
         raise InputError(file, f"holds {len(values)} poses for {len(stamps)} frames", "give one a frame")
     R = Rotation.from_quat(values[:, 3:]).as_matrix()

@@ -56,15 +56,18 @@ def read_camera(path: Path, width: int, height: int, depth_units_per_m: float) -
     remarks = []
     if any(values.get("distortion", ())):
         remarks.append(f"{path.name} gives lens distortion, which is not undone: undistort the images first")
-    camera = PinholeCamera(
-        width=width,
-        height=height,
-        fx_px=values["fx"],
-        fy_px=values["fy"],
-        cx_px=values["cx"],
-        cy_px=values["cy"],
-        depth_units_per_m=values.get("depth_units_per_m", depth_units_per_m),
-    )
+    try:
+        camera = PinholeCamera(
+            width=width,
+            height=height,
+            fx_px=values["fx"],
+            fy_px=values["fy"],
+            cx_px=values["cx"],
+            cy_px=values["cy"],
+            depth_units_per_m=values.get("depth_units_per_m", depth_units_per_m),
+        )
+    except InputError as error:
+        raise InputError(path, error.problem, error.remedy) from None
     return camera, remarks
 
 

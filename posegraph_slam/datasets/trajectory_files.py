@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from posegraph_slam.arrays import FloatArray
 from posegraph_slam.datasets.csv_table import read_csv
-from posegraph_slam.datasets.number_text import read_table, refuse_first
+from posegraph_slam.datasets.number_text import read_table, refuse_first, require_in_range
 from posegraph_slam.datasets.tum import read_tum, write_tum
 from posegraph_slam.errors import InputError, did_you_mean
 from posegraph_slam.files import replacing
@@ -105,18 +105,25 @@ def _read_tum(path: Path, times: Path | None, parent: str, child: str) -> Trajec
 
 def _read_kitti(path: Path, times: Path | None, parent: str, child: str) -> Trajectory:
     values, numbers = read_table(path, KITTI_COLUMNS)
+    require_in_range(values, path, numbers)
     matrices = values.reshape(-1, 3, 4)
     R, t = matrices[:, :, :3], matrices[:, :, 3]
     odd = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > ROTATION_TOLERANCE
-    refuse_first(odd | (np.linalg.det(R) < 0) | ~np.isfinite(values).all(axis=1), path, numbers, "holds no rotation")
+    refuse_first(odd | (np.linalg.det(R) < 0), path, numbers, "holds no rotation")
     R = Rotation.from_matrix(R).as_matrix()  # the nearest rotation to the rounded matrix
     beside = [times] if times else [path.with_name(f"{path.stem}_times.txt"), path.with_name("times.txt")]
     file = next((each for each in beside if times or each.is_file()), None)
-    stamps = np.arange(len(R), dtype=np.float64) if file is None else read_table(file, ("stamp",))[0][:, 0]
+    stamps = np.arange(len(R), dtype=np.float64) if file is None else _read_stamps(file)
     if len(stamps) != len(R):
         problem = f"holds {len(stamps)} stamps, but {path.name} {len(R)} poses"
         raise InputError(str(file), problem, "give their own file by --times")
     return Trajectory(stamps_s=stamps, poses=pose_from_rotation_translation(R, t), parent=parent, child=child)
+
+
+def _read_stamps(file: Path) -> FloatArray:
+    values, numbers = read_table(file, ("stamp",))
+    require_in_range(values, file, numbers)
+    return values[:, 0]
 
 
 def _read_euroc(path: Path, times: Path | None, parent: str, child: str) -> Trajectory:
@@ -133,8 +140,7 @@ def _read_csv(path: Path, times: Path | None, parent: str, child: str) -> Trajec
 def _from_quaternions(
     path: Path, stamps_s: FloatArray, t: FloatArray, quat_xyzw: FloatArray, numbers: list[int], frames: tuple[str, str]
 ) -> Trajectory:
-    finite = np.isfinite(np.column_stack([stamps_s, t, quat_xyzw])).all(axis=1)
-    refuse_first(~finite, path, numbers, "holds a value that is not finite")
+    require_in_range(np.column_stack([stamps_s, t, quat_xyzw]), path, numbers)
     refuse_first(np.linalg.norm(quat_xyzw, axis=1) < 1e-6, path, numbers, "holds a zero quaternion")
     poses = pose_from_rotation_translation(Rotation.from_quat(quat_xyzw).as_matrix(), t)
     return Trajectory(stamps_s=stamps_s, poses=poses, parent=frames[0], child=frames[1])

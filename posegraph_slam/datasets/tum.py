@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.datasets.number_text import read_table, refuse_first
+from posegraph_slam.datasets.number_text import read_table, refuse_first, require_in_range
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import Trajectory, pose_from_rotation_translation
 
@@ -23,7 +23,7 @@ def read_tum(path: str | Path, *, parent: str, child: str) -> Trajectory:
     """
     path = Path(path)
     values, numbers = read_table(path, COLUMNS)
-    refuse_first(~np.isfinite(values).all(axis=1), path, numbers, "holds a value that is not finite")
+    require_in_range(values, path, numbers)
     # A unit quaternion written with any number of digits is far above this; below, the direction is rounding noise.
     zero = np.linalg.norm(values[:, 4:], axis=1) < 1e-6
     refuse_first(zero, path, numbers, "holds a zero quaternion, which is no rotation")

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
+from posegraph_slam.arrays import LARGEST, BoolArray, FloatArray, IntArray, in_range, range_fault
 from posegraph_slam.errors import GraphError
 from posegraph_slam.jit import kernel
 from posegraph_slam.pose_graph.graph import PoseGraph
@@ -82,14 +82,15 @@ def _check_indices(graph: PoseGraph) -> None:
 def _check_poses(graph: PoseGraph) -> None:
     measured = graph.constraints.T_i_j
     if (row := _first(pose_faults(np.array(graph.poses)))) is not None:
-        finite = np.isfinite(graph.poses[row]).all()
+        pose = graph.poses[row]
+        usable = in_range(pose).all()
         raise GraphError(
-            node_name(graph, row), "its rotation is not orthonormal" if finite else "its pose is not finite"
+            node_name(graph, row), "its rotation is not orthonormal" if usable else f"its pose is {range_fault(pose)}"
         )
     if (edge := _first(pose_faults(np.array(measured)))) is not None:
-        finite = np.isfinite(measured[edge]).all()
-        problem = "the rotation of its measurement is not orthonormal" if finite else "its measurement is not finite"
-        raise GraphError(edge_name(graph, edge), problem)
+        if in_range(measured[edge]).all():
+            raise GraphError(edge_name(graph, edge), "the rotation of its measurement is not orthonormal")
+        raise GraphError(edge_name(graph, edge), f"its measurement is {range_fault(measured[edge])}")
 
 
 def _check_information(graph: PoseGraph) -> None:
@@ -98,8 +99,8 @@ def _check_information(graph: PoseGraph) -> None:
     if len(suspects) == 0:
         return
     suspect = information[suspects]
-    if (first := _first(~np.isfinite(suspect).all(axis=(1, 2)))) is not None:
-        raise GraphError(edge_name(graph, int(suspects[first])), "its information is not finite")
+    if (first := _first(~in_range(suspect).all(axis=(1, 2)))) is not None:
+        raise GraphError(edge_name(graph, int(suspects[first])), f"its information is {range_fault(suspect[first])}")
     if (first := _first(asymmetry(suspect) > SYMMETRY_TOLERANCE)) is not None:
         edge = int(suspects[first])
         raise GraphError(edge_name(graph, edge), "its information is not symmetric", "give a symmetric matrix")
@@ -117,7 +118,7 @@ def _check_information(graph: PoseGraph) -> None:
 
 @kernel
 def pose_faults(poses: FloatArray) -> BoolArray:
-    """Tell which poses (n, d+1, d+1) are not finite or have a matrix that is no rotation."""
+    """Tell which poses (n, d+1, d+1) are not finite, far too large or have a matrix that is no rotation."""
     d = poses.shape[1] - 1
     result = np.zeros(len(poses), np.bool_)
     for k in range(len(poses)):
@@ -132,17 +133,17 @@ def pose_faults(poses: FloatArray) -> BoolArray:
         if d == 3:  # the last column is the product of the others: with the sign of a rotation, not of a reflection
             turned = turned * T[2, 2] + (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0]) * T[0, 2]
             turned += (T[2, 0] * T[0, 1] - T[0, 0] * T[2, 1]) * T[1, 2]
-        finite = True
+        usable = True
         for row in range(d + 1):
             for column in range(d + 1):
-                finite = finite and np.isfinite(T[row, column])
-        result[k] = not (finite and worst <= ROTATION_TOLERANCE and turned > 0.0)
+                usable = usable and abs(T[row, column]) <= LARGEST
+        result[k] = not (usable and worst <= ROTATION_TOLERANCE and turned > 0.0)
     return result
 
 
 @kernel
 def information_faults(information: FloatArray) -> BoolArray:
-    """Tell which matrices (E, p, p) are not finite, symmetric and, by Cholesky with a margin, positive definite."""
+    """Tell which matrices (E, p, p) are not in range, symmetric and, by Cholesky with a margin, positive definite."""
     p = information.shape[1]
     L, result = np.empty((p, p)), np.zeros(len(information), np.bool_)
     for e in range(len(information)):
@@ -150,7 +151,7 @@ def information_faults(information: FloatArray) -> BoolArray:
         for a in range(p):
             trace += M[a, a]
             for b in range(p):
-                good = good and np.isfinite(M[a, b])
+                good = good and abs(M[a, b]) <= LARGEST
                 largest, skew = max(largest, abs(M[a, b])), max(skew, abs(M[a, b] - M[b, a]))
         good = good and skew <= SYMMETRY_TOLERANCE * largest
         for a in range(p):

@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray, in_range
 from posegraph_slam.errors import GraphError
 from posegraph_slam.pose_graph.checks import component_labels, edge_name
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
@@ -78,7 +78,7 @@ def clamp_indefinite(graph: PoseGraph) -> Edited:
     repaired: `GraphError` names the first.
     """
     c, all_edges = graph.constraints, np.ones(len(graph.constraints), dtype=np.bool_)
-    if not np.isfinite(c.information).all():
+    if not in_range(c.information).all():
         return Edited(graph=graph, kept=all_edges, note="")  # the check of the graph names the edge
     symmetric = symmetrised(c.information)
     values, vectors = np.linalg.eigh(symmetric)

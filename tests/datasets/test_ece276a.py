@@ -92,6 +92,8 @@ NOT_FINITE = np.where(np.arange(12) == 3, np.nan, STAMPS)
         ({"Encoders__counts": np.zeros((4, 11))}, r"'counts' has shape \(4, 11\)"),
         ({"Encoders__counts": np.full((4, 12), 0.5)}, "'counts' at index 0 is not a whole number"),
         ({"Encoders__counts": np.full((4, 12), np.nan)}, "'counts' is not finite at index 0"),
+        ({"Encoders__counts": np.full((4, 12), 2**63, np.uint64)}, r"'counts' at index 0 is 9\.22337e\+18 ticks"),
+        ({"Imu__linear_acceleration": np.full((3, 48), 1e300)}, r"'linear_acceleration' is beyond 1e\+30 at index 0"),
         ({"Encoders__counts": np.full((4, 12), "a")}, "'counts' is <U1, not a number"),
         ({"Encoders__counts": np.full((4, 12), None)}, r"Encoders7\.npz: cannot be read as an \.npz archive"),
         ({"Encoders__time_stamps": NOT_FINITE}, r"Encoders7\.npz: field 'time_stamps' is not finite at index 3"),

@@ -36,9 +36,10 @@ def test_a_recording_without_truth_or_mounting_is_read(tmp_path: Path, log_build
     assert log.imu is not None
     assert log.truth is None
     np.testing.assert_array_equal(log.imu.T_base_imu, np.eye(4))
-    (folder / "imu0" / "sensor.yaml").write_text("T_BS:\n  data: [1, 2, 3]\n")
-    with pytest.raises(InputError, match=r"sensor\.yaml: holds no pose T_BS"):
-        datasets.read(folder)
+    for numbers in ("1, 2, 3", ", ".join(["nan"] * 16)):
+        (folder / "imu0" / "sensor.yaml").write_text(f"T_BS:\n  data: [{numbers}]\n")
+        with pytest.raises(InputError, match=r"sensor\.yaml: holds no pose T_BS"):
+            datasets.read(folder)
 
 
 def test_a_clock_that_runs_backwards_is_refused(tmp_path: Path, log_builder: Builder) -> None:

@@ -198,3 +198,11 @@ def test_the_real_joint_file(psg_data: Path) -> None:
     assert len(joints) == 38318
     assert np.ptp(joints.neck_yaw_rad) < 0.01  # this walk looks straight ahead
     assert 0.2 < joints.head_pitch_rad.max() < 1.0
+
+
+@pytest.mark.parametrize("field", ["ts", "head_angles"])
+def test_joint_fields_of_text_are_named(field: str, tmp_path: Path) -> None:
+    content: dict[str, object] = {"ts": np.arange(3.0)[None], "head_angles": np.zeros((2, 3))}
+    savemat(tmp_path / "train_joint0.mat", content | {field: "text"})
+    with pytest.raises(InputError, match=rf"train_joint0\.mat: field '{field}' holds <U4, not numbers"):
+        read_joints(tmp_path / "train_joint0.mat")

@@ -191,6 +191,7 @@ def test_says_that_distortion_stays(tmp_path: Path) -> None:
         ('{"fx": 50, "fy": 51, "cx": 1, "cy": 2, "width": 640, "height": 480}', "640 x 480"),
         ('{"intrinsic_matrix": [1, 2]}', "9 numbers"),
         ('{"fx": 50,', "camera.json:1: is not valid JSON"),
+        ('{"fx": -1, "fy": 1, "cx": 0, "cy": 0}', r"camera\.json: fx -1, fy 1 and depth unit .* are not all positive"),
         ('{"fx": -50, "fy": 51, "cx": 1, "cy": 2}', "not all positive"),
     ],
 )
@@ -245,3 +246,11 @@ def test_headers_tell_size_and_kind(tmp_path: Path, suffix: str, shape: tuple[in
     header = read_image_header(image(tmp_path / f"a{suffix}", np.ones(shape, np.uint8)))
     assert (header.height, header.width, header.bits) == (7, 9, 8)
     assert header.channels == (3 if len(shape) == 3 else 1)
+
+
+@pytest.mark.parametrize(("row", "problem"), [("0 0 nan 0 0 0 1", "not finite"), ("0 0 0 0 0 0 0", "zero quaternion")])
+def test_true_poses_without_stamps_are_checked(tmp_path: Path, row: str, problem: str) -> None:
+    folder = plain_folder(tmp_path / "log")
+    (folder / "pose.txt").write_text(f"0 0 0 0 0 0 1\n{row}\n0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match=rf"pose\.txt:2: holds a .*{problem}"):
+        datasets.read(folder)

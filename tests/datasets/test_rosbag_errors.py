@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -129,3 +130,17 @@ def test_an_image_of_an_unknown_encoding_is_named(tmp_path: Path) -> None:
         list(camera.images())
     with pytest.raises(InputError, match="has 1 images"):
         camera.images(np.array([1]))
+
+
+def test_metadata_without_counts_are_refused(tmp_path: Path) -> None:
+    folder = store_as("mcap", tmp_path, robot(maker_of("mcap")))
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(re.sub(r"message_count: 20", "message_count: many", metadata.read_text()))
+    assert "cannot be opened as a bag" in refused(folder)
+
+
+def test_what_the_bag_library_quotes_is_cut(tmp_path: Path) -> None:
+    folder = store_as("mcap", tmp_path, robot(maker_of("mcap")))
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(".mcap", ".mcap" + 9000 * "x"))
+    assert len(refused(folder)) < 1000

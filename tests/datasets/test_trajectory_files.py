@@ -133,3 +133,27 @@ def test_unknown_formats_and_suffixes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not finite"):
         write_trajectory(bad, tmp_path / "a.kitti")
     assert not list(tmp_path.iterdir())
+
+
+CSV_HEAD, CSV_ROW = b"stamp_s,x_m,y_m,z_m,qx,qy,qz,qw\n", b"1,2,3,4,0,0,0,1\n"
+
+
+@pytest.mark.parametrize("head", [b"", CSV_HEAD, b"\xef\xbb\xbf" + CSV_HEAD, b"\xef\xbb\xbf", b"\xff\xfe,text\n"])
+def test_a_table_may_begin_with_words_and_with_a_byte_order_mark(head: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(head + CSV_ROW)
+    np.testing.assert_array_equal(read_trajectory(tmp_path / "a.csv").positions, [[2, 3, 4]])
+
+
+@pytest.mark.parametrize("first", [b"\xff" + CSV_ROW, b"one" + CSV_ROW])
+def test_a_damaged_first_row_is_not_taken_for_a_header(first: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(first + CSV_ROW)
+    with pytest.raises(InputError, match=r"a\.csv:1: does not begin with 8 numbers"):
+        read_trajectory(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("stamp", ["nan", "-inf", "1e300"])
+def test_stamps_of_kitti_poses_are_checked(stamp: str, tmp_path: Path) -> None:
+    (tmp_path / "a.kitti").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    (tmp_path / "times.txt").write_text(f"1\n{stamp}\n")
+    with pytest.raises(InputError, match=r"times\.txt:2: holds a value that is (not finite|beyond)"):
+        read_trajectory(tmp_path / "a.kitti")

@@ -72,6 +72,7 @@ def test_comments_blank_lines_and_unnormalised_quaternions(tmp_path: Path) -> No
         ("2 0 0 0 0 0 0 0", "zero quaternion"),
         ("2 0 0 0 nan 0 0 1", "not finite"),
         ("inf 0 0 0 0 0 0 1", "not finite"),
+        ("2 0 0 1e300 0 0 0 1", r"beyond 1e\+30"),
         ("2 0 0 0 0 0 1", "has 7 columns instead of the 8"),
         ("2 0 0 0 0 0 0 1 9", "has 9 columns"),
         ("2 0 zero 0 0 0 0 1", "not a number"),

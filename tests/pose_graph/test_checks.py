@@ -59,6 +59,8 @@ def test_sessions_are_named(graph: PoseGraph) -> None:
         ("T_i_j", (5, 0, 1), np.nan, r"edge 5 \(node 5 to node 6\): its measurement is not finite"),
         ("T_i_j", (5, 0, 0), 3.0, r"edge 5 \(node 5 to node 6\): the rotation of its measurement is not orthonormal"),
         ("information", (5, 0, 0), np.inf, r"edge 5 \(node 5 to node 6\): its information is not finite"),
+        ("T_i_j", (5, 0, 2), 1e300, r"edge 5 \(node 5 to node 6\): its measurement is beyond 1e\+30"),
+        ("information", (5, 0, 0), 1e40, r"edge 5 \(node 5 to node 6\): its information is beyond 1e\+30"),
         ("information", (5, 0, 1), 1e6, r"edge 5 \(node 5 to node 6\): its information is not symmetric"),
         ("information", (5, 0, 0), -1e6, r"edge 5 \(node 5 to node 6\): its information is not positive definite"),
         ("information", (5,), 0.0, r"edge 5 \(node 5 to node 6\): its information is not positive definite"),

@@ -18,6 +18,9 @@ STORAGES = (".mcap", ".db3")
 METADATA = "metadata.yaml"
 REPAIR = "copy it again, or repair it by `rosbag reindex` (ROS 1), `ros2 bag reindex` or `mcap recover` (ROS 2)"
 
+QUOTED_MAX = 200
+"""Errors of the bag library quote what they read, which may be any part of a damaged file."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Topic:
@@ -139,13 +142,14 @@ def open_bag(path: Path) -> Iterator[Bag]:
         # the reader keeps what it opened in one stack, closed even when opening fails halfway
         reader = AnyReader(_files(path), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
+        bag = Bag(path, reader)
     except InputError:
         raise
     except Exception as error:
         problem = f"cannot be opened as a bag ({first_line(error)})"
         raise InputError(path, problem, f"it may be truncated: {REPAIR}") from error
     try:
-        yield Bag(path, reader)
+        yield bag
     finally:
         reader.close()
 
@@ -164,5 +168,6 @@ def _files(path: Path) -> list[Path]:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error, or its name."""
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    """Return the first line of an error, at most `QUOTED_MAX` characters of it, or its name."""
+    line = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    return line if len(line) <= QUOTED_MAX else f"{line[:QUOTED_MAX]} ..."
