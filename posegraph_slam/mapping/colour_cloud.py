@@ -90,16 +90,18 @@ def fuse_cloud(
     settings: ColourCloudSettings,
     *,
     depth_units_per_m: float,
+    frames: IntArray | None = None,
     executor: Executor | None = None,
     progress: Progress = silent_progress,
 ) -> ColourCloud:
     """Fuse the frames taken at poses (N, 4, 4) by a camera [fx, fy, cx, cy] into one cloud.
 
-    Pixels at jumps of depth and on surfaces seen at a grazing angle are left out; the rest counts by the inverse of
-    its depth's variance. Raises InputError where no voxel gets enough points.
+    `frames` (m,) are the numbers of those to fuse, all where None. Pixels at jumps of depth and on surfaces seen at a
+    grazing angle are left out; the rest counts by the inverse of its depth's variance. Raises InputError where no voxel
+    gets enough points.
     """
     executor = executor or SerialExecutor()
-    chosen = np.arange(0, len(T_map_camera), settings.frame_stride)
+    chosen = (np.arange(len(T_map_camera)) if frames is None else frames)[:: settings.frame_stride]
     work = [chosen[a:b] for a, b in split_range(len(chosen), FRAMES_A_PIECE)]
     fuse = partial(
         _fuse_piece, images=images, poses=T_map_camera, camera=camera, settings=settings, units=depth_units_per_m

@@ -24,6 +24,7 @@ from posegraph_slam.odometry.rgbd_odometry import RgbdOdometry, track_rgbd
 from posegraph_slam.pipeline.clock import StageClock
 from posegraph_slam.pipeline.configuration import Configuration
 from posegraph_slam.pipeline.outcome import JobOutcome
+from posegraph_slam.pipeline.rgbd_frame_status import FrameParts, frame_parts
 from posegraph_slam.pipeline.rgbd_frames import FrameImages, PreparedFrames, chosen_camera
 from posegraph_slam.pose_graph.graph import ConstraintKind, PoseGraph
 from posegraph_slam.pose_graph.solve import solve
@@ -43,6 +44,7 @@ class RgbdResult(JobOutcome):
     """
 
     odometry: RgbdOdometry
+    parts: FrameParts
     cloud: ColourCloud | None
     samples: Mapping[str, FloatArray]
     """Points (n, 3) of some keyframes, placed by each stage: what the thickness was measured on."""
@@ -81,31 +83,33 @@ def optimize_rgbd(
         views = KeyframeViews(frames, tracked.keyframes, executor)
         closed = _close(tracked, views, configuration, executor, progress)
         optimised = deform(tracked.trajectory, tracked.keyframes, closed.graph.poses)
+        parts = frame_parts(tracked, closed.graph)
     stages = {"odometry": tracked.trajectory, "optimised": optimised.with_poses(optimised.poses, parent="map")}
     cloud = None
     if configuration.maps:
         with clock.stage("fusing"):
             cloud = fuse_cloud(
                 images, stages["optimised"].poses, camera.vector(), settings.cloud,
-                depth_units_per_m=camera.depth_units_per_m, executor=executor, progress=progress,
+                depth_units_per_m=camera.depth_units_per_m, frames=parts.main, executor=executor, progress=progress,
             )  # fmt: skip
     with clock.stage("evaluation"):
-        samples, cells = _samples(stages, tracked.keyframes, views, settings.cloud.max_depth_m)
+        samples, cells = _samples(stages, tracked.keyframes, parts, views, settings.cloud.max_depth_m)
         gaps = _first_to_last(stages, tracked.keyframes, views, configuration)
         table, metrics = _compared(stages, log.truth, cells, gaps)
         upward = upward_direction(cells["optimised"], -stages["optimised"].poses[:, :3, 1].mean(axis=0))
     notes = (*_without_replaced(log.remarks, bool(remarks)), *remarks)
-    warnings = (*tracked.remarks, *_warnings(closed, cloud, settings.cloud))
+    warnings = (*tracked.remarks, *parts.remarks(), *_warnings(closed, cloud, settings.cloud))
     return RgbdResult(
         stages=stages,
         odometry=tracked,
+        parts=parts,
         graph=closed.graph,
         loops=closed.records,
         cloud=cloud,
         samples=samples,
         upward=upward,
         comparison=table,
-        metrics={**metrics, **_summary(tracked, closed, cloud), "remarks": notes, "warnings": warnings},
+        metrics={**metrics, **_summary(tracked, parts, closed, cloud), "remarks": notes, "warnings": warnings},
         stages_s=clock.seconds,
         truth=log.truth,
         remarks=(*notes, *warnings),
@@ -141,11 +145,12 @@ def _close(
 
 
 def _samples(
-    stages: Mapping[str, Trajectory], keyframes: IntArray, views: KeyframeViews, max_depth_m: float
+    stages: Mapping[str, Trajectory], keyframes: IntArray, parts: FrameParts, views: KeyframeViews, max_depth_m: float
 ) -> tuple[dict[str, FloatArray], dict[str, SurfaceCells]]:
-    """Points of some keyframes in the frame of each stage, and the surfaces that they make there."""
-    count = len(keyframes)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, SAMPLED_KEYFRAMES)).astype(np.int64)).tolist()
+    """Points of some keyframes of the largest part in the frame of each stage, and the surfaces they make there."""
+    rows = np.flatnonzero(parts.part[keyframes] == 0)
+    count = len(rows)
+    chosen = rows[np.unique(np.linspace(0, count - 1, min(count, SAMPLED_KEYFRAMES)).astype(np.int64))].tolist()
     points = []
     for k in chosen:
         reference = views.reference(k)
@@ -208,11 +213,15 @@ def _compared(
     return table, {"stages": {name: m.as_dict() for name, m in measured.items()}, "images": more}
 
 
-def _summary(tracked: RgbdOdometry, closed: LoopClosureResult, cloud: ColourCloud | None) -> dict[str, Any]:
+def _summary(
+    tracked: RgbdOdometry, parts: FrameParts, closed: LoopClosureResult, cloud: ColourCloud | None
+) -> dict[str, Any]:
     """Counts of the run for `metrics.json`."""
     return {
         "frames": len(tracked.trajectory),
         "frames_tracked": int(tracked.tracked.sum()),
+        "parts": parts.count,
+        "frames_of_largest_part": len(parts.main),
         "keyframes": len(tracked.keyframes),
         "guessed_motions": int(tracked.guessed.sum()),
         **closed.summary(),

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from posegraph_slam.loop_closure.rgbd_closing import RgbdLoopSettings
 from posegraph_slam.mapping.colour_cloud import ColourCloudSettings
-from posegraph_slam.odometry.rgbd_odometry import RgbdOdometrySettings
+from posegraph_slam.odometry.rgbd_tracker import RgbdOdometrySettings
 from posegraph_slam.settings import Settings
 
 

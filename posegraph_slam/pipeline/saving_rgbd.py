@@ -13,13 +13,20 @@ from posegraph_slam.pose_graph.g2o import write_g2o
 CLOUD = "maps/cloud.ply"
 TRAJECTORY_FILES = {"odometry": "odometry.tum", "optimised": "trajectory.tum"}
 """File of each stage's trajectory: a pose of the camera for every frame."""
+FRAMES = "frames.csv"
 
 
 def save_rgbd_run(result: RgbdResult, directory: RunDirectory) -> None:
-    """Write trajectories, graph, loop candidates, metrics and the cloud; docs/rgbd.md describes the files."""
+    """Write trajectories, frames, graph, loop candidates, metrics and the cloud; docs/rgbd.md describes the files."""
     for stage, name in TRAJECTORY_FILES.items():
         write_tum(result.stages[stage], directory.path(name))
     write_g2o(result.graph, directory.path("graph.g2o"))
+    parts = result.parts
+    directory.write_rows(
+        FRAMES,
+        ["frame", "stamp_s", "status", "part"],
+        zip(range(len(parts.part)), result.trajectory.stamps_s, parts.status(), parts.part, strict=True),
+    )
     stamps = result.trajectory.stamps_s[result.keyframes]
     write_loops(result.loops, result.keyframes, stamps, directory, record=RgbdLoopRecord, unit="frame")
     directory.write_json(METRICS, {"table": result.comparison.as_dict(), **result.metrics})

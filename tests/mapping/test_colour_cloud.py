@@ -118,3 +118,10 @@ def test_surfaces_that_frames_place_apart_are_thick() -> None:
     )
     up = upward_direction(thick, np.array([0.3, 0.2, 1.0]))
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-2)
+
+
+def test_fuses_the_frames_that_are_asked_for() -> None:
+    chosen = fuse_cloud(wall(2.0), steps(5), CAMERA, SETTINGS, depth_units_per_m=1000, frames=np.array([0, 1, 2]))
+    first = fuse_cloud(wall(2.0), steps(5)[:3], CAMERA, SETTINGS, depth_units_per_m=1000)
+    np.testing.assert_array_equal(chosen.points, first.points)
+    np.testing.assert_array_equal(chosen.counts, first.counts)

@@ -17,7 +17,8 @@ from posegraph_slam.datasets.simulation.rgbd_room import (
 )
 from posegraph_slam.errors import InputError
 from posegraph_slam.geometry import SE3
-from posegraph_slam.odometry.rgbd_odometry import RgbdOdometrySettings, track_rgbd
+from posegraph_slam.odometry.rgbd_odometry import track_rgbd
+from posegraph_slam.odometry.rgbd_tracker import RgbdOdometrySettings
 from posegraph_slam.pipeline.executors import make_executor
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, prepare_frame
 
@@ -83,17 +84,58 @@ def test_frames_that_show_nothing_are_interpolated() -> None:
     assert any("2 frames could not be aligned" in remark for remark in found.remarks)
 
 
-def test_after_a_long_gap_the_motion_is_a_guess_that_says_so() -> None:
-    poses = np.concatenate([POSES[:5], POSES[5:9], POSES[60:66]])
+def test_where_nothing_leads_on_the_motion_is_a_guess_that_says_so() -> None:
+    poses = np.concatenate([POSES[:9], POSES[60:66]])
     settings = SETTINGS.model_copy(update={"lost_frames_max": 2})
     found = track_rgbd(Film(poses, dark=(5, 6, 7, 8)), np.arange(15.0), settings)
-    assert found.guessed.sum() >= 1
-    k = int(np.flatnonzero(found.guessed)[-1])
+    np.testing.assert_array_equal(np.flatnonzero(~found.tracked), [5, 6, 7, 8])
+    assert found.guessed.sum() == 1
+    k = int(np.flatnonzero(found.guessed)[0])
+    assert found.keyframes[k] == 4, "the last frame before the gap is a node"
+    assert found.keyframes[k + 1] == 9, "and so is the first one behind it"
     assert np.linalg.inv(found.information[k])[3, 3] == pytest.approx(settings.lost_sigma_m**2)
-    assert any("tracking was lost" in remark for remark in found.remarks)
-    # behind the gap the camera is tracked again
-    step = SE3.between(found.trajectory.poses[10], found.trajectory.poses[14])
-    assert np.linalg.norm(SE3.local(SE3.between(poses[10], poses[14]), step)) < 0.05
+    assert any("tracking was lost before frame 9" in remark for remark in found.remarks)
+    # behind the gap the camera is tracked from the first frame on
+    step = SE3.between(found.trajectory.poses[9], found.trajectory.poses[14])
+    assert np.linalg.norm(SE3.local(SE3.between(poses[9], poses[14]), step)) < 0.05
+
+
+def test_a_long_darkness_is_bridged_when_the_view_is_known_again() -> None:
+    dark = tuple(range(4, 19))
+    poses = np.concatenate([POSES[:4], np.repeat(POSES[4:5], 15, axis=0), POSES[4:8]])
+    found = track_rgbd(Film(poses, dark=dark), np.arange(23.0), SETTINGS)
+    np.testing.assert_array_equal(np.flatnonzero(~found.tracked), dark)
+    assert not found.guessed.any()
+    shift, _ = errors(found.trajectory.poses, poses)
+    assert shift[found.tracked].max() < 0.02
+
+
+def test_frames_seen_while_lost_are_placed_by_one_that_fits_both_places() -> None:
+    # away at once to a view that has nothing in common with the last one, and back slowly to where it was
+    film = Film(np.concatenate([POSES[:4], POSES[24:3:-3], POSES[4:7]]))
+    found = track_rgbd(film, np.arange(14.0), SETTINGS)
+    assert found.tracked.all()
+    assert not found.guessed.any()
+    shift, turn = errors(found.trajectory.poses, film.poses)
+    assert shift.max() < 0.05
+    assert turn.max() < 1.0
+
+
+def test_views_of_elsewhere_that_lead_nowhere_are_left_out() -> None:
+    elsewhere = POSES[[50, 51, 75, 100, 101]]
+    film = Film(np.concatenate([POSES[:4], elsewhere, POSES[5:8]]))
+    found = track_rgbd(film, np.arange(12.0), SETTINGS)
+    np.testing.assert_array_equal(np.flatnonzero(~found.tracked), [4, 5, 6, 7, 8])
+    assert not found.guessed.any()
+    shift, _ = errors(found.trajectory.poses, film.poses)
+    assert shift[found.tracked].max() < 0.02
+
+
+def test_a_first_frame_that_shows_nothing_begins_nothing() -> None:
+    found = track_rgbd(Film(POSES[:16], dark=(0, 1)), np.arange(16.0), SETTINGS)
+    np.testing.assert_array_equal(np.flatnonzero(~found.tracked), [0, 1])
+    assert found.keyframes[0] == 2
+    np.testing.assert_array_equal(found.trajectory.poses[:3], np.tile(np.eye(4), (3, 1, 1)))
 
 
 def test_features_bridge_a_leap() -> None:

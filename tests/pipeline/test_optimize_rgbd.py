@@ -75,6 +75,35 @@ def test_the_run_directory_holds_poses_graph_loops_and_cloud(finished: Path, log
         assert (finished / f"figures/{name}.png").stat().st_size > 1000
 
 
+def test_frames_that_show_something_else_stay_out_of_the_cloud(tmp_path: Path) -> None:
+    path = loop_through_room(160)
+    room, camera = furnished_room(seed=3), small_camera(160, 120)
+    folder = write_rgbd_log(tmp_path / "log", room, camera, np.concatenate([path[:5], path[[60, 100]], path[5:9]]))
+    run(folder, load_configuration(["default"], ["workers=1"]), out=tmp_path / "run")
+    with (tmp_path / "run/frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] == "interpolated" for row in rows] == [False] * 5 + [True] * 2 + [False] * 4
+    assert [row["part"] for row in rows] == ["0"] * 5 + ["-1"] * 2 + ["0"] * 4
+    assert rows[0]["status"] == rows[-1]["status"] == "keyframe"
+    points = read_ply(tmp_path / "run/maps/cloud.ply")
+    world = points @ path[0][:3, :3].T + path[0][:3, 3]
+    assert (world > room.boxes[0, :3] - 0.1).all()
+    assert (world < room.boxes[0, 3:] + 0.1).all()
+
+
+def test_a_part_that_no_loop_ties_to_the_rest_is_left_out_and_named(tmp_path: Path) -> None:
+    path = loop_through_room(160)
+    poses = np.concatenate([path[:8], path[80:85]])
+    folder = write_rgbd_log(tmp_path / "log", furnished_room(seed=3), small_camera(160, 120), poses)
+    result = optimize_rgbd(read(folder), load_configuration(["default"], ["rgbd.odometry.lost_frames_max=2"]))
+    np.testing.assert_array_equal(result.parts.part, [0] * 8 + [1] * 5)
+    assert result.metrics["parts"] == 2
+    assert any("5 frames from 8 on" in remark for remark in result.remarks)
+    assert result.cloud is not None
+    world = result.cloud.points @ path[0][:3, :3].T + path[0][:3, 3]
+    assert (world < furnished_room(seed=3).boxes[0, 3:] + 0.1).all()
+
+
 def test_a_second_run_with_two_workers_gives_the_same_bytes(finished: Path, log: Path, tmp_path: Path) -> None:
     out = tmp_path / "again"
     run(log, load_configuration(["default"], ["workers=2"]), out=out)
