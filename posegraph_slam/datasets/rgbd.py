@@ -126,6 +126,8 @@ def _associated_pairs(file: Path, remarks: list[str]) -> _Pairs:
             stamps, names = (float(words[0]), float(words[2])), (words[1], words[3])
         except (ValueError, IndexError):
             raise InputError(f"{file}:{number}", "is not two pairs of a stamp and a file", "correct the line") from None
+        if not in_range(stamps).all():
+            raise InputError(f"{file}:{number}", f"a stamp is {range_fault(stamps)}", "correct the line")
         first.append(_listed_file(file, number, names[0]))
         second.append(_listed_file(file, number, names[1]))
         first_s.append(stamps[0])

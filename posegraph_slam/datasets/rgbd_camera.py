@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from posegraph_slam.arrays import LARGEST
 from posegraph_slam.errors import InputError
 from posegraph_slam.sensors import PinholeCamera
 
@@ -97,6 +98,8 @@ def _from_json(text: str, path: Path) -> dict[str, Any]:
         content = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}:{error.lineno}", f"is not valid JSON ({error.msg})", "correct the file") from error
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, thousands of brackets
+        raise InputError(path, f"is not valid JSON ({error})", "correct the file") from error
     if not isinstance(content, dict):
         raise InputError(path, "does not hold a JSON object", "give fx, fy, cx and cy")
     lowered = {str(key).lower(): value for key, value in content.items()}
@@ -149,6 +152,8 @@ def _yaml_matrix(text: str, name: str) -> list[float]:
 def _number(value: Any, name: str, path: Path) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(path, f"'{name}' is not a number", "correct the value")
+    if not abs(value) <= LARGEST:  # nor is NaN, which JSON does not have but Python reads
+        raise InputError(path, f"'{name}' is {value:.6g}", "correct the value")
     return float(value)
 
 

@@ -45,13 +45,13 @@ def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
 
 
 def read_npz(path: Path, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, npt.NDArray[Any]]:
-    """Read the arrays `names` of an .npz archive, and those of `optional` that it has.
+    """Read the numeric arrays `names` of an .npz archive, and those of `optional` that it has.
 
     InputError names the file and what is wrong with it.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in (*names, *(name for name in optional if name in archive))}
+            arrays = {name: archive[name] for name in (*names, *(name for name in optional if name in archive))}
     except FileNotFoundError as error:
         raise InputError(path, "no such file") from error
     except KeyError as error:
@@ -62,6 +62,10 @@ def read_npz(path: Path, names: tuple[str, ...], optional: tuple[str, ...] = ())
         raise InputError(
             path, f"cannot be read as .npz ({error})", "the file may be truncated: make it again"
         ) from error
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biuf":
+            raise InputError(path, f"'{name}' does not hold numbers ({array.dtype})", "make the file again")
+    return arrays
 
 
 def geometry_arrays(geometry: GridGeometry) -> dict[str, npt.NDArray[Any]]:
@@ -91,10 +95,15 @@ def read_occupancy(path: Path) -> OccupancyGrid:
     wrong = [f"{name} has shape {arrays[name].shape}" for name, want in wanted.items() if arrays[name].shape != want]
     if len(shape) != 2 or wrong:
         raise InputError(path, f"log_odds has shape {shape}" + "".join(f", {text}" for text in wrong), "make it again")
-    geometry = GridGeometry(
-        origin_m=arrays["origin_m"],
-        resolution_m=float(arrays["resolution_m"]),
-        shape=(shape[0], shape[1]),
-        yaw_rad=float(arrays["yaw_rad"]),
-    )
+    if not np.isfinite(arrays["log_odds"]).all():
+        raise InputError(path, "log_odds is not finite", "make it again")
+    try:
+        geometry = GridGeometry(
+            origin_m=arrays["origin_m"],
+            resolution_m=float(arrays["resolution_m"]),
+            shape=(shape[0], shape[1]),
+            yaw_rad=float(arrays["yaw_rad"]),
+        )
+    except InputError as error:
+        raise InputError(path, error.problem, "make it again") from error
     return OccupancyGrid(geometry=geometry, log_odds=arrays["log_odds"], observed=arrays["observed"])

@@ -147,7 +147,7 @@ def _stage(run: ComparedRun) -> Mapping[str, Any]:
 def _lookup(values: Any, path: tuple[str, ...]) -> float | None:
     for name in path:
         values = values.get(name) if isinstance(values, Mapping) else None
-    return None if values is None else float(values)
+    return float(values) if isinstance(values, int | float) else None
 
 
 def _quality(quality: MapQuality, name: str) -> float:

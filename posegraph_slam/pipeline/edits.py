@@ -143,7 +143,7 @@ def read_edits(path: Path) -> Edits:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not valid TOML: {error}") from error
     try:
         return Edits.model_validate(values)

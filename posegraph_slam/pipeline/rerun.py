@@ -9,7 +9,7 @@ from pathlib import Path
 from posegraph_slam.errors import ConfigurationError, InputError, did_you_mean
 from posegraph_slam.pipeline.configuration import Configuration, load_configuration
 from posegraph_slam.pipeline.edits import Edits, read_edits
-from posegraph_slam.pipeline.run_directory import CONFIGURATION, read_run_directory
+from posegraph_slam.pipeline.run_directory import CONFIGURATION, RECORD, read_run_directory
 
 STAGE_SWITCHES = {
     "odometry": (),
@@ -66,14 +66,17 @@ def plan_run(
             f"{did_you_mean(start, STARTS)}it is {' or '.join(STARTS)}",
         )
     run = read_run_directory(log)
-    source = Path(run.record["input"]["path"])
+    read = run.record.get("input", {})
+    if not read.get("path") or not read.get("format"):
+        raise InputError(log / RECORD, "does not say which log was read", "optimise the log again, without --from")
+    source = Path(read["path"])
     if not source.exists():
         raise InputError(source, f"is gone: {log} was made from it", "put the log back, or optimise it where it is now")
     return RunPlan(
         log=source,
         configuration=load_configuration([log / CONFIGURATION, *files], overrides, seed=seed, workers=workers),
-        log_format=run.record["input"]["format"],
-        topics=run.record["input"].get("topics"),
+        log_format=read["format"],
+        topics=read.get("topics"),
         matching_of=log if start == "graph" else None,
         edits=read_edits(edits) if edits is not None else None,
     )

@@ -22,6 +22,7 @@ import numpy as np
 from posegraph_slam.errors import InputError
 from posegraph_slam.files import replacing
 from posegraph_slam.pipeline.configuration import Configuration, load_configuration
+from posegraph_slam.pipeline.run_forms import MetricsForm, RecordForm, read_form
 from posegraph_slam.pipeline.settings_files import to_toml
 
 RECORD, CONFIGURATION, METRICS, LOOPS = "run.json", "config.toml", "metrics.json", "loops.csv"
@@ -169,7 +170,7 @@ def read_run_directory(folder: Path) -> StoredRun:
     """Read back what `create_run_directory` left; raise InputError where `folder` is no complete run."""
     if not (folder / RECORD).is_file():
         raise InputError(folder, f"is not a run directory (it has no {RECORD})", "name a folder made by psg optimize")
-    record = _read_json(folder / RECORD)
+    record = read_form(folder / RECORD, RecordForm)
     version = record.get("format_version")
     if version != FORMAT_VERSION:
         raise InputError(
@@ -179,15 +180,5 @@ def read_run_directory(folder: Path) -> StoredRun:
         folder=folder,
         record=record,
         configuration=load_configuration([folder / CONFIGURATION]),
-        metrics=_read_json(folder / METRICS) if (folder / METRICS).is_file() else {},
+        metrics=read_form(folder / METRICS, MetricsForm) if (folder / METRICS).is_file() else {},
     )
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not valid JSON: {error}", "run `psg optimize` again to write it") from error
-    if not isinstance(value, dict):
-        raise InputError(path, "does not hold a JSON object", "run `psg optimize` again to write it")
-    return value

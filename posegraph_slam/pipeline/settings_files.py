@@ -43,7 +43,7 @@ def read_layer(path: Path) -> Layer:
             return Layer(source=str(path), values=tomllib.load(file))
     except OSError as error:
         raise ConfigurationError(path, f"cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigurationError(path, f"is not valid TOML: {error}") from error
 
 
@@ -62,7 +62,7 @@ def parse_override(text: str) -> Layer:
 def _parse_value(text: str) -> Any:
     try:
         parsed = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
     return parsed["value"] if set(parsed) == {"value"} else text
 

@@ -46,7 +46,7 @@ def better(metric: str) -> int:
 
 def table_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of a run's comparison, none where the run compares nothing."""
-    return list(metrics.get("table", {}).get("rows", []))
+    return list(metrics.get("table", {}).get("rows") or [])
 
 
 def printed(row: Mapping[str, Any], value: float | None) -> str:
@@ -62,7 +62,7 @@ def key_figures(content: RunContent) -> list[Figure]:
         figures.append(
             Figure(
                 label="Loop closures",
-                value=count(metrics["loops_accepted"]),
+                value=count(metrics.get("loops_accepted", 0)),
                 note=f"of {count(metrics['loops_proposed'])} candidates",
             )
         )
@@ -72,7 +72,8 @@ def key_figures(content: RunContent) -> list[Figure]:
         duration = float(np.ptp(last.stamps_s))
         # files are in the order of their stamps; the path was measured in that of the scans, which may differ
         stage = metrics.get("stages", {}).get(name, {})
-        length_m = stage.get("path", {}).get("length_m", last.path_length_m)
+        length_m = (stage.get("path") or {}).get("length_m")
+        length_m = last.path_length_m if length_m is None else length_m
         nodes = f", {count(metrics['keyframes'])} keyframes" if "keyframes" in metrics else ""
         figures.append(
             Figure(

@@ -63,7 +63,7 @@ def read_stages(run: StoredRun) -> dict[str, Trajectory]:
         for stage, file in TRAJECTORY_FILES.items()
         if (run.folder / file).is_file()
     }
-    named = list(run.metrics.get("table", {}).get("stages", []))
+    named = list(run.metrics.get("table", {}).get("stages") or [])
     if len(named) == len(stages):
         return dict(zip(named, stages.values(), strict=True))
     return {"estimate": next(iter(stages.values()))} if len(stages) == 1 else stages

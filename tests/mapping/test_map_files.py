@@ -191,7 +191,11 @@ def test_unusable_archives_are_named(tmp_path):
     with np.load(path, allow_pickle=False) as arrays:
         np.savez(tmp_path / "shapes.npz", **{**arrays, "observed": np.ones((50, 49), dtype=bool)})
         np.savez(tmp_path / "version.npz", **{**arrays, "format_version": np.array(99)})
-    others = [(tmp_path / f"{name}.npz").read_bytes() for name in ("pickled", "other", "shapes", "version")]
+        np.savez(tmp_path / "place.npz", **{**arrays, "origin_m": np.array([0.0, np.inf])})
+        np.savez(tmp_path / "text.npz", **{**arrays, "origin_m": np.array(["a", "b"])})
+        np.savez(tmp_path / "nan.npz", **{**arrays, "log_odds": np.full((50, 50), np.nan)})
+    kinds = ("pickled", "other", "shapes", "version", "place", "text", "nan")
+    others = [(tmp_path / f"{name}.npz").read_bytes() for name in kinds]
     for content in (whole[: len(whole) // 2], b"", b"text", *others):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"map\.npz"):

@@ -166,6 +166,10 @@ def test_errors_name_the_file_that_the_value_came_from(tmp_path: Path) -> None:
     path.write_bytes(b"seed = '\xff'\n")
     with pytest.raises(ConfigurationError, match="not valid TOML"):
         read_layer(path)
+    for text in ("seed = " + "9" * 5000, "seed = " + "[" * 100_000):
+        path.write_text(text)
+        with pytest.raises(ConfigurationError, match=r"mine\.toml: is not valid TOML"):
+            read_layer(path)
     with pytest.raises(ConfigurationError, match=r"absent\.toml: cannot be read \(No such file"):
         read_layer(tmp_path / "absent.toml")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,31 @@ def test_wrong_stages_and_runs_are_named(finished: Path, tmp_path: Path) -> None
     (moved / "run.json").write_text(json.dumps(record))
     with pytest.raises(InputError, match="is gone"):
         plan_run(moved, [], [], start="graph")
+    del record["input"]
+    (moved / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"run\.json: does not say which log was read"):
+        plan_run(moved, [], [], start="graph")
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "problem"),
+    [
+        ("scan_information", np.ravel, "has shape"),
+        ("keyframe_information", lambda a: a[:-1], "has shape"),
+        ("matched_fraction", lambda a: a * np.nan, "not finite"),
+        ("poses", lambda a: a * 1e300, "beyond"),
+        ("keyframes", lambda a: a[::-1], "rising numbers of scans"),
+        ("keyframes", lambda a: a + 1000, "rising numbers of scans"),
+        ("lag", lambda a: a.astype(str), "does not hold numbers"),
+    ],
+)
+def test_a_damaged_array_of_the_matching_is_named(
+    name: str, spoil: Callable[[np.ndarray], np.ndarray], problem: str, finished: Path, tmp_path: Path
+) -> None:
+    arrays = dict(np.load(finished / MATCHING))
+    (tmp_path / MATCHING).write_bytes(npz_bytes({**arrays, name: spoil(arrays[name])}))
+    with pytest.raises(InputError, match=rf"scan_matching\.npz: '{name}' .*{problem}"):
+        read_matching(tmp_path / MATCHING, len(arrays["stamps_s"]))
 
 
 def test_matching_without_wheels_is_of_wheels_as_they_are(finished: Path, tmp_path: Path) -> None:

@@ -121,6 +121,43 @@ def test_what_is_not_a_run_says_so(tmp_path: Path) -> None:
         read_run_directory(tmp_path)
 
 
+DIGITS = "9" * 5000
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "problem"),
+    [
+        ("run.json", '{"format_version": 1, "stages_s": {"maps": "x"}}', r"'stages_s\.maps' cannot be used"),
+        ("run.json", '{"format_version": 1, "total_s": NaN}', "'total_s' cannot be used"),
+        ("run.json", '{"format_version": 1, "input": []}', "'input' cannot be used"),
+        ("run.json", '{"format_version": 1, "command": -1}', "'command' cannot be used"),
+        ("run.json", f'{{"total_s": {DIGITS}}}', "not valid JSON"),
+        ("run.json", "[" * 200_000, "not valid JSON"),
+        ("run.json", "\ufeff{}", "not valid JSON"),
+        (
+            "metrics.json",
+            '{"table": {"rows": [{"metric": "a", "unit": ""}]}}',
+            r"'table\.rows\.0\.values' cannot be used",
+        ),
+        ("metrics.json", '{"table": {"stages": 3}}', r"'table\.stages' cannot be used"),
+        ("metrics.json", '{"stages": {"optimised": 1}}', r"'stages\.optimised' cannot be used"),
+        ("metrics.json", '{"loops_proposed": "many"}', "'loops_proposed' cannot be used"),
+    ],
+)
+def test_a_key_of_the_wrong_kind_is_named(file: str, text: str, problem: str, tmp_path: Path) -> None:
+    write_run(tmp_path / "run")
+    (tmp_path / "run" / file).write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=problem) as caught:
+        read_run_directory(tmp_path / "run")
+    assert caught.value.where.endswith(file)
+
+
+def test_keys_that_are_null_or_unknown_are_no_fault(tmp_path: Path) -> None:
+    write_run(tmp_path / "run")
+    (tmp_path / "run" / "metrics.json").write_text('{"table": null, "stages": {}, "own": [1, {"a": null}]}')
+    assert read_run_directory(tmp_path / "run").metrics == {"stages": {}, "own": [1, {"a": None}]}
+
+
 class Colour(StrEnum):
     RED = "red"
 
