@@ -56,15 +56,21 @@ def attitude(
     if log.imu is None:
         raise InputError(run, "holds no IMU", "give a log with gyro and accelerometer")
     estimates = {name: estimate_attitude(log.imu, method=name.value) for name in Method}
-    comparison = None if log.truth is None else compare(log.imu, estimates, log.truth, written=method)
+    comparison, apart = None, []
+    if log.truth is not None:
+        try:
+            comparison = compare(log.imu, estimates, log.truth, written=method)
+        except InputError as error:
+            apart = [f"not compared with the truth: {error}"]
     out.parent.mkdir(parents=True, exist_ok=True)
     write_tum(estimates[method].trajectory, out)
     if figure is not None:
         from posegraph_slam.report.attitude_figures import draw_attitude
 
         shown = [method, *(name for name in Method if name is not method)]
-        draw_attitude({n.value: estimates[n].trajectory for n in shown}, figure, truth=log.truth, title=run.name)
-    remarks = [*log.remarks, *estimates[method].remarks]
+        truth = log.truth if comparison else None
+        draw_attitude({n.value: estimates[n].trajectory for n in shown}, figure, truth=truth, title=run.name)
+    remarks = [*log.remarks, *estimates[method].remarks, *apart]
     if as_json:
         print_json(record(out, method, estimates[method], comparison=comparison, remarks=remarks))
     elif not quiet:

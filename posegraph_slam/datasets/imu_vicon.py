@@ -18,6 +18,8 @@ from posegraph_slam.geometry import Trajectory, pose_from_rotation_translation
 from posegraph_slam.sensors import RobotLog
 
 ORTHONORMAL_TOLERANCE = 1e-3
+LOST_SHARE_MAX = 0.5
+"""Motion capture loses a body now and then; matrices that are mostly no rotations are something else."""
 
 
 def detects(path: Path) -> bool:
@@ -41,11 +43,12 @@ def read(path: str | Path) -> RobotLog:
     stamps = archive.stamps("imu_stamps_s")
     counts = archive.finite_samples("imu_raw", 6, stamps)
     imu, remarks = imu_from_counts(counts, stamps, where=f"{path}, field 'imu_raw'")
-    truth = _truth(archive) if "vicon_rotation" in archive else None
-    return RobotLog(path=path, format="imu_vicon", imu=imu, truth=truth, remarks=remarks)
+    truth, lost = _truth(archive) if "vicon_rotation" in archive else (None, ())
+    return RobotLog(path=path, format="imu_vicon", imu=imu, truth=truth, remarks=(*remarks, *lost))
 
 
-def _truth(archive: Archive) -> Trajectory:
+def _truth(archive: Archive) -> tuple[Trajectory, tuple[str, ...]]:
+    """Return the truth without the samples at which the motion capture lost the board, and a remark on these."""
     stamps = archive.stamps("vicon_stamps_s")
     R = np.asarray(archive.numbers("vicon_rotation"), dtype=np.float64)
     if R.shape != (3, 3, len(stamps)):
@@ -54,7 +57,14 @@ def _truth(archive: Archive) -> Trajectory:
     with np.errstate(invalid="ignore"):
         bad = ~(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHONORMAL_TOLERANCE)
         bad |= ~(np.linalg.det(R) > 0)
-    if bad.any():
-        raise InputError(archive.path, f"field 'vicon_rotation' holds no rotation at index {int(np.argmax(bad))}")
-    poses = pose_from_rotation_translation(R, np.zeros((len(R), 3)))
-    return Trajectory(stamps_s=stamps, poses=poses, parent="ref", child="base")
+    if bad.mean() > LOST_SHARE_MAX:
+        where = f"at {int(bad.sum())} of {len(R)} stamps, first at index {int(np.argmax(bad))}"
+        raise InputError(archive.path, f"field 'vicon_rotation' holds no rotation {where}")
+    poses = pose_from_rotation_translation(R[~bad], np.zeros((int((~bad).sum()), 3)))
+    truth = Trajectory(stamps_s=stamps[~bad], poses=poses, parent="ref", child="base")
+    if not bad.any():
+        return truth, ()
+    first = stamps[int(np.argmax(bad))] - stamps[0]
+    return truth, (
+        f"no truth at {int(bad.sum())} of {len(R)} of its stamps, first at {first:.2f} s: no rotations there",
+    )

@@ -16,7 +16,8 @@ from posegraph_slam.datasets.raw_imu_states import MIN_STILL_S, find_rest, gyro_
 from posegraph_slam.errors import InputError
 from posegraph_slam.sensors import STANDARD_GRAVITY, Imu, ImuCalibration
 
-MV_PER_COUNT = 3300.0 / 1023.0
+ADC_MAX = 1023
+MV_PER_COUNT = 3300.0 / ADC_MAX
 ACCELEROMETER_MV_PER_G = 330.0
 GYRO_MV_PER_DEG_S = 3.33
 """Data sheets: both sensitivities are ratiometric or amplified, with a tolerance near ten per cent."""
@@ -61,7 +62,7 @@ def imu_from_counts(
     naming `where` for counts outside 0 to 1023 and for an unknown board that never rests.
     """
     counts = np.asarray(counts, dtype=np.float64)
-    outside = (counts < 0) | (counts > 1023)
+    outside = (counts < 0) | (counts > ADC_MAX)
     if outside.any():
         index = int(np.argmax(outside.any(axis=0)))
         raise InputError(where, f"counts outside 0 to 1023 at index {index}", "expected the raw values of a 10-bit ADC")
@@ -77,13 +78,13 @@ def imu_from_counts(
         raise InputError(
             where, f"the board never rests for {MIN_STILL_S:g} s", "the gyros' zero levels cannot be found"
         )
-    remark += how
+    remarks = (remark + how, *_clipped(counts[3:], stamps_s))
     if not silent.any():
-        return imu, (remark,)
+        return imu, remarks
     seconds = float(np.diff(stamps_s, append=stamps_s[-1])[silent].sum())
     at = float(stamps_s[int(np.argmax(silent))] - stamps_s[0])
     return imu, (
-        remark,
+        *remarks,
         f"the gyros put out their reference voltage for {seconds:.2f} s, first at {at:.2f} s: no rates",
     )
 
@@ -95,6 +96,16 @@ def _remark(rest: slice | None, stamps_s: FloatArray) -> str:
     if rest.start == 0:
         return f"zero rates from a still start of {seconds:.1f} s"
     return f"the board moves from the start: zero rates from a rest of {seconds:.1f} s at {first:.1f} s"
+
+
+def _clipped(counts: FloatArray, stamps_s: FloatArray) -> tuple[str, ...]:
+    """Tell where gyro channels `counts` (3, N) are at an end of the ADC's range: the body turned faster than that."""
+    clipped = ((counts <= 0) | (counts >= ADC_MAX)).any(axis=0)
+    if not clipped.any():
+        return ()
+    seconds = float(np.diff(stamps_s, append=stamps_s[-1])[clipped].sum())
+    at = float(stamps_s[int(np.argmax(clipped))] - stamps_s[0])
+    return (f"the gyros are at the end of their range for {seconds:.2f} s, first at {at:.2f} s: they turned faster",)
 
 
 def _by_data_sheet(counts: FloatArray, stamps_s: FloatArray, *, gyro_zero: FloatArray) -> Imu:

@@ -32,8 +32,10 @@ class TiltSettings(Settings):
     """Take the acceleration that the wheels show off the accelerometer's."""
     wheel_smoothing_s: float = Field(default=0.1, gt=0, le=2)
     """Standard deviation of the Gaussian that smooths the wheels' way before it is differentiated twice."""
-    attitude: AttitudeSettings = AttitudeSettings(accelerometer_sigma_rad=0.05, accelerometer_excess_factor=2.0)
-    """The filter; what the accelerometer shows beside gravity is smaller once the wheels' part is taken off."""
+    attitude: AttitudeSettings = AttitudeSettings(
+        accelerometer_sigma_rad=0.05, accelerometer_lasting_s=0.01, accelerometer_excess_factor=2.0
+    )
+    """The filter; what the accelerometer shows beside gravity is smaller and shorter once the wheels' part is off."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

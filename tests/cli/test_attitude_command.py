@@ -81,6 +81,17 @@ def test_run_without_truth_gives_the_same_file(run: Path, tmp_path: Path) -> Non
     assert (tmp_path / "run.tum").read_bytes() == (tmp_path / "bare.tum").read_bytes()
 
 
+def test_truth_on_another_clock_is_told_and_costs_no_estimate(run: Path, tmp_path: Path) -> None:
+    with np.load(run) as archive:
+        fields = dict(archive)
+    np.savez(run, **{**fields, "vicon_stamps_s": fields["vicon_stamps_s"] + 1e4})
+    result = psg("attitude", run, "--out", tmp_path / "a.tum", "--figure", tmp_path / "a.png")
+    assert result.exit_code == 0, result.output
+    assert "not compared with the truth: evaluation: only 0 of 600 true stamps are covered" in result.stderr
+    assert "RMSE" not in result.stdout
+    assert len(np.loadtxt(tmp_path / "a.tum")) == 600
+
+
 def test_existing_files_are_kept_unless_told(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.tum"
     out.write_text("mine")

@@ -210,6 +210,24 @@ def test_run_is_recognised_and_read(tmp_path: Path) -> None:
     assert without.truth is None
 
 
+def test_stamps_without_truth_are_left_out(tmp_path: Path) -> None:
+    R = a_run()["vicon_rotation"].copy()
+    R[:, :, 20:25], R[:, :, 60] = np.nan, 0.0
+    log = read(write(tmp_path, vicon_rotation=R))
+    assert log.truth is not None
+    assert len(log.truth) == 244
+    assert "no truth at 6 of 250 of its stamps, first at 0.40 s" in log.remarks[-1]
+    assert np.isfinite(log.truth.poses).all()
+
+
+def test_rates_beyond_the_range_are_told(tmp_path: Path) -> None:
+    raw = a_run()["imu_raw"].copy()
+    raw[4, 350:360] = 1023
+    told = read(write(tmp_path, imu_raw=raw)).remarks
+    assert "the gyros are at the end of their range for 0.10 s, first at 3.50 s" in told[1]
+    assert not any("end of their range" in remark for remark in read(write(tmp_path)).remarks)
+
+
 T = 1.3e9 + 0.01 * np.arange(500)
 
 
@@ -228,8 +246,8 @@ T = 1.3e9 + 0.01 * np.arange(500)
         ({"imu_stamps_s": np.zeros(0), "imu_raw": np.zeros((6, 0))}, "expected"),
         ({"vicon_stamps_s": None}, "no field 'vicon_stamps_s'"),
         ({"vicon_stamps_s": T}, "'vicon_rotation' has shape"),
-        ({"vicon_rotation": np.ones((3, 3, 250))}, "holds no rotation at index 0"),
-        ({"vicon_rotation": np.full((3, 3, 250), np.nan)}, "holds no rotation at index 0"),
+        ({"vicon_rotation": np.ones((3, 3, 250))}, "no rotation at 250 of 250 stamps, first at index 0"),
+        ({"vicon_rotation": np.full((3, 3, 250), np.nan)}, "no rotation at 250 of 250 stamps"),
         ({"vicon_rotation": np.ones((250, 3, 3))}, "'vicon_rotation' has shape"),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from posegraph_slam.arrays import FloatArray
@@ -33,6 +34,7 @@ NOISE = AttitudeSettings(
     gyro_noise_rad_per_sqrt_rad=0.0,
     bias_walk_rad_s_per_sqrt_s=1e-4,
     accelerometer_sigma_rad=0.05,
+    accelerometer_lasting_s=0.0,
     accelerometer_excess_factor=0.0,
     max_excess=10.0,
 )
@@ -161,6 +163,52 @@ def test_explicit_state_equals_the_stream() -> None:
         np.testing.assert_array_equal(state.quat_wxyz, stream.quat_wxyz[k])
     np.testing.assert_array_equal(state.gyro_bias, stream.gyro_bias[-1])
     np.testing.assert_array_equal(state.covariance, stream.covariance[-1])
+
+
+def test_samples_within_the_time_that_motion_lasts_share_the_weight_of_one() -> None:
+    lasting = NOISE.model_copy(update={"accelerometer_lasting_s": 0.1})
+    state, accel = a_state(np.eye(3), sigma=0.02), STANDARD_GRAVITY * np.array([0.02, -0.03, 1.0])
+    once = update(state, accel, lasting, 0.1)
+    assert update(state, accel, lasting, 0.0) is state
+    np.testing.assert_array_equal(once.covariance, update(state, accel, NOISE).covariance)
+    for count in (5, 20):
+        many = state
+        for _ in range(count):
+            many = update(many, accel, lasting, 0.1 / count)
+        assert angle(once.rotation, many.rotation) < 2e-4
+        np.testing.assert_allclose(many.covariance, once.covariance, rtol=0.01, atol=1e-7)
+
+
+def hand_held(seed: int, rate_hz: float) -> tuple[Imu, Trajectory]:
+    """A body that tumbles slowly while a hand shakes it by 0.05 g for some tenths of a second, sampled at `rate_hz`."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, 40, 1 / rate_hz)
+    knots = np.arange(0, 40.2, 0.2)
+    shake = CubicSpline(knots, rng.normal(0, 0.05, (len(knots), 3)))(t)
+    turn = Rotation.from_euler("xyz", np.column_stack([0.8 * np.sin(0.7 * t), 0.6 * np.sin(0.5 * t), 0.3 * t]))
+    R = turn.as_matrix()
+    steps = SO3.log(R[:-1].transpose(0, 2, 1) @ R[1:]) * rate_hz
+    rates = 0.5 * (np.vstack([steps[:1], steps]) + np.vstack([steps, steps[-1:]]))
+    accel = STANDARD_GRAVITY * ((R.transpose(0, 2, 1) @ (shake + UP)[..., None])[..., 0])
+    imu = Imu(stamps_s=t, angular_velocity=1.01 * rates, linear_acceleration=accel, T_base_imu=np.eye(4))
+    poses = pose_from_rotation_translation(R, np.zeros((len(R), 3)))
+    return imu, Trajectory(stamps_s=t, poses=poses, parent="ref", child="base")
+
+
+def test_motion_that_lasts_is_not_believed_more_at_a_higher_rate() -> None:
+    """With errors taken for white, four times the rate follows the hand, not gravity."""
+    white = AttitudeSettings(accelerometer_lasting_s=0.0)
+
+    def tilt(rate_hz: float, settings: AttitudeSettings) -> float:
+        runs = (hand_held(seed, rate_hz) for seed in range(4))
+        estimates = ((estimate_attitude(imu, settings), truth) for imu, truth in runs)
+        return float(np.mean([attitude_errors(each.trajectory, truth).tilt_deg for each, truth in estimates]))
+
+    slow, fast = (tilt(rate_hz, AttitudeSettings()) for rate_hz in (50.0, 200.0))
+    assert abs(fast - slow) < 0.1 * slow
+    slow_white, fast_white = (tilt(rate_hz, white) for rate_hz in (50.0, 200.0))
+    assert fast_white > 1.15 * slow_white
+    assert fast < 0.9 * fast_white
 
 
 def test_bias_is_found_without_a_still_start() -> None:

@@ -17,6 +17,7 @@ NOISE = AttitudeSettings(
     gyro_noise_rad_per_sqrt_rad=0.0,
     bias_walk_rad_s_per_sqrt_s=1e-3,
     accelerometer_sigma_rad=0.05,
+    accelerometer_lasting_s=0.0,
     accelerometer_excess_factor=0.0,
     max_excess=10.0,
 )

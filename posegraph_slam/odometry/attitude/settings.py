@@ -15,8 +15,9 @@ class AttitudeSettings(Settings):
     """Noise of gyro and accelerometer as the filter believes it, and how the start is recognised.
 
     The accelerometer shows the vertical only as far as the body does not accelerate: its sigma is that of unmodelled
-    motion (0.1 g tilts it by 0.1 rad), which dwarfs the sensor's own 0.005 rad, and lasts longer than one sample. The
-    size |a| shows only the vertical part of that motion: where it is off by 0.02, the direction may be by far more.
+    motion (0.1 g tilts it by 0.1 rad), which dwarfs the sensor's own 0.005 rad. Motion lasts longer than one sample: a
+    hand's for some 0.03 s, so that three samples at 100 Hz tell what one at 33 Hz does, and no more. The size |a|
+    shows only the vertical part of that motion: where it is off by 0.02, the direction may be by far more.
     """
 
     gyro_noise_rad_per_sqrt_s: float = Field(default=0.005, gt=0, description="rad of sigma after 1 s, white noise")
@@ -30,6 +31,9 @@ class AttitudeSettings(Settings):
     still_bias_sigma_rad_s: float = Field(default=3e-4, gt=0, description="least sigma of a bias from a still start")
     unknown_bias_sigma_rad_s: float = Field(default=0.02, gt=0, description="sigma of the bias without a still start")
     accelerometer_sigma_rad: float = Field(default=0.1, gt=0, description="sigma of the vertical where |a| is g")
+    accelerometer_lasting_s: float = Field(
+        default=0.03, ge=0, description="how long its error lasts; samples within this time share the weight of one"
+    )
     accelerometer_excess_factor: float = Field(
         default=5.0, ge=0, description="growth of that sigma with | |a|/g - 1 |, added in squares"
     )

@@ -139,20 +139,22 @@ def update_core(q, bias, P, up, sigma, L, points, errors):  # type: ignore[no-un
 
 
 @kernel
-def correct(q, bias, P, accel, noise, L, points, errors):  # type: ignore[no-untyped-def]
+def correct(q, bias, P, accel, dt, noise, L, points, errors):  # type: ignore[no-untyped-def]
     """Apply `update_core` with the direction of `accel` (3,) where the motion allows it, and tell whether it did.
 
-    `noise` holds gravity, sigma where |accel| is gravity, its growth with the relative excess, and the largest excess
-    that is believed. Values that are not finite are not believed.
+    `noise` holds gravity, sigma where |accel| is gravity, its growth with the relative excess, the largest excess that
+    is believed, and for how long an error lasts. Samples that come `dt` after the last one, within that time, share
+    what one alone would tell; one that comes at once tells nothing. Values that are not finite are not believed.
     """
+    share = dt / noise[4] if dt < noise[4] else 1.0
     size = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
     excess = abs(size / noise[0] - 1.0)
-    if not excess <= noise[3] or size == 0.0:
+    if not excess <= noise[3] or size == 0.0 or not share > 0.0:
         return False
     up = np.empty(3)
     for m in range(3):
         up[m] = accel[m] / size
-    update_core(q, bias, P, up, math.sqrt(noise[1] ** 2 + (noise[2] * excess) ** 2), L, points, errors)
+    update_core(q, bias, P, up, math.sqrt((noise[1] ** 2 + (noise[2] * excess) ** 2) / share), L, points, errors)
     return True
 
 
@@ -170,6 +172,6 @@ def filter_stream(dt, omega, accel, gyro_noise, accel_noise, q, bias, P):  # typ
     for k in range(n):
         if dt[k] > 0.0:
             predict_core(q, bias, P, omega[k], dt[k], gyro_noise, L, points, errors)
-        used[k] = correct(q, bias, P, accel[k], accel_noise, L, points, errors)
+        used[k] = correct(q, bias, P, accel[k], dt[k], accel_noise, L, points, errors)
         quaternions[k], biases[k], covariances[k] = q, bias, P
     return quaternions, biases, covariances, used

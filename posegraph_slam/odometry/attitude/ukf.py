@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,13 +59,16 @@ def predict(state: AttitudeState, omega: FloatArray, dt: float, settings: Attitu
     return AttitudeState(quat_wxyz=q, gyro_bias=bias, covariance=P)
 
 
-def update(state: AttitudeState, accel: FloatArray, settings: AttitudeSettings) -> AttitudeState:
+def update(state: AttitudeState, accel: FloatArray, settings: AttitudeSettings, dt: float = math.inf) -> AttitudeState:
     """Correct the state by the specific force `accel` (3,) m/s^2, which points up at rest.
 
+    `dt` is the time since the last correction: motion lasts, and samples within `accelerometer_lasting_s` share what one
+    alone would tell. Without it they are independent.
     Its sigma grows with | |a|/g - 1 |; beyond `max_excess` the state is returned as it was. Only the direction counts.
     """
     q, bias, P = state.copies()
-    if not correct(q, bias, P, np.asarray(accel, dtype=np.float64), accelerometer_noise(settings), *_workspace()):
+    noise = accelerometer_noise(settings)
+    if not correct(q, bias, P, np.asarray(accel, dtype=np.float64), float(dt), noise, *_workspace()):
         return state
     return AttitudeState(quat_wxyz=q, gyro_bias=bias, covariance=P)
 
@@ -84,7 +88,7 @@ def run_ukf(
 ) -> UkfStream:
     """Predict and update over a stream, in one kernel: `dt` (N,), rates over each step and `accel` at its end (N, 3).
 
-    Gives what `predict` and `update` give one by one; a step of no duration is only updated.
+    Gives what `predict` and `update` give one by one, each with its `dt`; a step of no duration is not predicted.
     """
     dt, omega, accel = (np.ascontiguousarray(each, dtype=np.float64) for each in (dt, omega, accel))
     noise = gyro_noise(settings), accelerometer_noise(settings)
@@ -120,6 +124,7 @@ def accelerometer_noise(settings: AttitudeSettings) -> FloatArray:
         settings.accelerometer_sigma_rad,
         settings.accelerometer_excess_factor,
         settings.max_excess,
+        settings.accelerometer_lasting_s,
     ])  # fmt: skip
 
 
