@@ -62,9 +62,9 @@ def predict(state: AttitudeState, omega: FloatArray, dt: float, settings: Attitu
 def update(state: AttitudeState, accel: FloatArray, settings: AttitudeSettings, dt: float = math.inf) -> AttitudeState:
     """Correct the state by the specific force `accel` (3,) m/s^2, which points up at rest.
 
-    `dt` is the time since the last correction: motion lasts, and samples within `accelerometer_lasting_s` share what one
-    alone would tell. Without it they are independent.
-    Its sigma grows with | |a|/g - 1 |; beyond `max_excess` the state is returned as it was. Only the direction counts.
+    `dt` is the time since the last correction: motion lasts, and samples within `accelerometer_lasting_s` share what
+    one alone would tell; without `dt` they are independent. The sigma grows with | |a|/g - 1 |; beyond `max_excess` the
+    state is returned as it was. Only the direction counts.
     """
     q, bias, P = state.copies()
     noise = accelerometer_noise(settings)
