@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from posegraph_slam.arrays import in_range, range_fault
 from posegraph_slam.errors import ConfigurationError, InputError, did_you_mean
 from posegraph_slam.pose_graph.editing import (
     Component,
@@ -115,6 +116,10 @@ def _with_edge(graph: PoseGraph, request: str) -> PoseGraph:
         ordered = np.empty(6)
         ordered[TRANSLATION_FIRST] = sigmas
         sigmas = ordered
+    if not in_range(values).all():
+        raise ConfigurationError("--add-edge", f"{request!r} holds a number that is {range_fault(values)}")
+    if not all(node.is_integer() for node in values[:2]):
+        raise ConfigurationError("--add-edge", f"{request!r} does not begin with the ids of two nodes")
     T = pose_of_numbers("--add-edge", np.array(values[2 : 2 + size]))
     return add_edge(graph, int(values[0]), int(values[1]), T, information=information_from_sigmas(sigmas))
 

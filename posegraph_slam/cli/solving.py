@@ -98,8 +98,8 @@ def solve(
         print_note(note)
     with ProgressBars(enabled=not quiet and not as_json) as progress:
         optimum = find_optimum(problem, settings, progress=progress)
+    asked = covariances(optimum, marginal or [], relative or [])  # before anything is written: it may fail
     seconds = {"read": read_s, **optimum.seconds, "write": write_files(optimum, out, edges)}
-    asked = covariances(optimum, marginal or [], relative or [])
     if plot is not None:
         draw(optimum, plot, graph.name)
     report = summary(graph, optimum, seconds, notes)

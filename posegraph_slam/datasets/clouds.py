@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 
@@ -14,9 +13,6 @@ from posegraph_slam.datasets.cloud_text import read_text_points
 from posegraph_slam.datasets.pcd import read_pcd
 from posegraph_slam.datasets.ply import read_ply
 from posegraph_slam.errors import InputError
-
-UNREADABLE = (ValueError, TypeError, OSError, EOFError, SyntaxError, TokenError, MemoryError)
-"""What numpy.load raises for files that are damaged or no arrays."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +53,7 @@ def is_cloud(path: Path) -> bool:
 def _read_npy(path: Path) -> FloatArray:
     try:
         array = np.load(path, allow_pickle=False)
-    except UNREADABLE as error:
+    except Exception as error:  # a damaged header fails in every way that a parser can
         problem = f"cannot be read as an array ({[*str(error).splitlines(), type(error).__name__][0]})"
         raise InputError(path, problem, "store the points as one numeric array") from error
     if not isinstance(array, np.ndarray):

@@ -54,7 +54,7 @@ def _truth(archive: Archive) -> tuple[Trajectory, tuple[str, ...]]:
     if R.shape != (3, 3, len(stamps)):
         raise InputError(archive.path, f"field 'vicon_rotation' has shape {R.shape}", f"expected (3, 3, {len(stamps)})")
     R = np.moveaxis(R, 2, 0)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         bad = ~(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHONORMAL_TOLERANCE)
         bad |= ~(np.linalg.det(R) > 0)
     if bad.mean() > LOST_SHARE_MAX:

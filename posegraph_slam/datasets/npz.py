@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +10,6 @@ import numpy.typing as npt
 
 from posegraph_slam.arrays import FloatArray, in_range, range_fault
 from posegraph_slam.errors import InputError
-
-UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError, NotImplementedError)
 
 
 class Archive:
@@ -24,7 +20,7 @@ class Archive:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 self._fields: dict[str, npt.NDArray[Any]] = {name: archive[name] for name in archive.files}
-        except (*UNREADABLE, AttributeError, TypeError) as error:
+        except Exception as error:  # a damaged archive fails in every way that a parser can
             problem = f"cannot be read as an .npz archive ({_first_line(error)})"
             raise InputError(path, problem, "the file may be truncated: copy or record it again") from error
 

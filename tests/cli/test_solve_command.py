@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -161,3 +162,22 @@ def test_an_edge_in_space_takes_a_quaternion(tmp_path: Path) -> None:
     report = json.loads(result.stdout)
     assert report["edges"] == 4
     assert report["certified"]
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (("--add-edge", "nan,1,0,0,0,1,1,1"), "--add-edge: .* holds a number that is not finite"),
+        (("--add-edge", "0,1,inf,0,0,1,1,1"), "--add-edge: .* holds a number that is not finite"),
+        (("--add-edge", "0,1.5,0,0,0,1,1,1"), "--add-edge: .* does not begin with the ids of two nodes"),
+        (("--marginal", "99"), "it has no node 99"),
+        (("--relative", f"0,{10**30}"), "it has no node 10{30}"),
+    ],
+)
+def test_requests_that_cannot_be_met_leave_no_file(
+    file: Path, tmp_path: Path, words: tuple[str, ...], problem: str
+) -> None:
+    result = run(file, "--no-certify", "--init", "given", "--out", tmp_path / "out.g2o", *words)
+    assert result.exit_code == 2
+    assert re.search(problem, result.stderr)
+    assert not (tmp_path / "out.g2o").exists()

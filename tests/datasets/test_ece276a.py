@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -233,3 +234,16 @@ def test_run_20(psg_data: Path) -> None:
     assert log.encoders.travel_m.mean(axis=1).sum() == pytest.approx(95.9, abs=0.2)
     assert np.median(np.linalg.norm(log.imu.linear_acceleration, axis=1)) == pytest.approx(9.92, abs=0.01)
     assert np.mean(log.scans.ranges_m == 60) == pytest.approx(0.0304, abs=1e-3)
+
+
+def test_a_damaged_header_of_an_array_is_named(ece276a_log: Callable[..., Path], tmp_path: Path) -> None:
+    file = ece276a_log(tmp_path) / "Encoders7.npz"
+    with np.load(file) as archive:
+        members = {f"{name}.npy": archive[name] for name in archive.files}
+    for damage in (b"{'descr': '<f8', 'fortran_order': False, 'shape': ((12,  ", b"}}", b"\0" * 20, b"None"):
+        with zipfile.ZipFile(file, "w") as archive:
+            for name in members:
+                header = damage.ljust(118) + b"\n"
+                archive.writestr(name, b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(96))
+        with pytest.raises(InputError, match=r"Encoders7\.npz: cannot be read as an \.npz archive"):
+            datasets.read(tmp_path)
