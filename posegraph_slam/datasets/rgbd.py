@@ -33,7 +33,8 @@ TUM_GAP_S = 0.02
 """Colour and depth frames further apart in time are not paired; the benchmark's own tool takes the same."""
 ASSUMED_RATE_HZ = 30.0
 
-_Pairs = tuple[list[Path], list[Path], FloatArray]
+_Pairs = tuple[list[Path], list[Path], FloatArray, FloatArray]
+"""Colour and depth files, stamps of the colour, and how much later the depth was taken."""
 
 
 def detects(path: Path) -> bool:
@@ -54,11 +55,11 @@ def read(path: Path) -> RobotLog:
     remarks: list[str] = []
     associations, tum = _associations(path), True
     if associations is not None:
-        colour, depth, stamps = _associated_pairs(associations, remarks)
+        colour, depth, stamps, lag_s = _associated_pairs(associations, remarks)
     elif (path / "rgb.txt").is_file() and (path / "depth.txt").is_file():
-        colour, depth, stamps = _listed_pairs(path, remarks)
+        colour, depth, stamps, lag_s = _listed_pairs(path, remarks)
     else:
-        colour, depth, stamps = _numbered_pairs(path, remarks)
+        colour, depth, stamps, lag_s = _numbered_pairs(path, remarks)
         tum = False
     header = _checked_headers(colour, depth)
     file = find_camera_file(path)
@@ -69,7 +70,9 @@ def read(path: Path) -> RobotLog:
         units = TUM_DEPTH_UNITS_PER_M if tum else DEPTH_UNITS_PER_M
         camera, more = read_camera(file, header.width, header.height, units)
         remarks += [f"intrinsics from {file.name}: {camera.describe()}", *more]
-    sequence = RgbdSequence(stamps_s=stamps, colour_files=tuple(colour), depth_files=tuple(depth), camera=camera)
+    sequence = RgbdSequence(
+        stamps_s=stamps, depth_lag_s=lag_s, colour_files=tuple(colour), depth_files=tuple(depth), camera=camera
+    )
     truth = _truth(path, stamps)
     return RobotLog(path=path, format="rgbd", rgbd_sequence=sequence, truth=truth, remarks=tuple(remarks))
 
@@ -95,7 +98,8 @@ def _listed_pairs(path: Path, remarks: list[str]) -> _Pairs:
     left = len(colour) - len(pairs)
     if left:
         remarks.append(f"{left} of {len(colour)} colour frames have no depth frame within {TUM_GAP_S:g} s: left out")
-    return [colour[c] for c in pairs[:, 0]], [depth[d] for d in pairs[:, 1]], colour_s[pairs[:, 0]]
+    stamps = colour_s[pairs[:, 0]]
+    return [colour[c] for c in pairs[:, 0]], [depth[d] for d in pairs[:, 1]], stamps, depth_s[pairs[:, 1]] - stamps
 
 
 def nearest_pairs(a_s: FloatArray, b_s: FloatArray, gap_s: float) -> IntArray:
@@ -137,8 +141,8 @@ def _associated_pairs(file: Path, remarks: list[str]) -> _Pairs:
     remarks.append(f"{len(first)} pairs of colour and depth from {file.name}")
     depth_first = read_image_header(first[0]).bits == 16 and read_image_header(second[0]).bits != 16
     if depth_first:
-        return second, first, np.array(second_s)
-    return first, second, np.array(first_s)
+        return second, first, np.array(second_s), np.array(first_s) - np.array(second_s)
+    return first, second, np.array(first_s), np.array(second_s) - np.array(first_s)
 
 
 def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
@@ -199,7 +203,7 @@ def _numbered_pairs(path: Path, remarks: list[str]) -> _Pairs:
     if stamps is None:
         stamps = np.arange(len(a)) / ASSUMED_RATE_HZ
         remarks.append(f"the frames have no stamps: {ASSUMED_RATE_HZ:g} frames a second are assumed")
-    return a, b, stamps
+    return a, b, stamps, np.zeros(len(stamps))
 
 
 def _images(folder: Path, suffixes: tuple[str, ...]) -> dict[tuple[float, str], Path]:

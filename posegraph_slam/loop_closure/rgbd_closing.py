@@ -120,7 +120,8 @@ def close_rgbd_loops(
             break
         made = round_ + 1
         findings = executor.map(partial(_align, views=views, settings=settings, seed=seed), trials)
-        found = _verify(graph, trials, findings, round_, ledger, settings)
+        measured = views.believed(_constraints(trials, findings))
+        found = _verify(graph, measured, trials, findings, round_, ledger, settings)
         before = graph.poses
         if len(found):
             closures = Constraints.concatenate([closures, found])
@@ -182,22 +183,22 @@ def _align(trial: _Trial, views: KeyframeViews, settings: RgbdLoopSettings, seed
     return _Finding(alignment=direct, matches=motion.matches, inliers=motion.inliers, reason=direct.problem or few)
 
 
-def _verify(
-    graph: PoseGraph,
-    trials: list[_Trial],
-    findings: list[_Finding],
-    round_: int,
-    ledger: Ledger,
-    settings: RgbdLoopSettings,
-) -> Constraints:
-    """Hold findings against the graph and each other, record all, and return those that pass."""
-    constraints = Constraints(
+def _constraints(trials: list[_Trial], findings: list[_Finding]) -> Constraints:
+    """What alignment found of each trial, usable or not."""
+    return Constraints(
         i=np.array([trial.target for trial in trials]),
         j=np.array([trial.source for trial in trials]),
         T_i_j=np.stack([finding.alignment.T_target_source for finding in findings]),
         information=np.stack([finding.alignment.information for finding in findings]),
         kind=np.array([int(trial.kind) for trial in trials]),
     )
+
+
+def _verify(
+    graph: PoseGraph, constraints: Constraints, trials: list[_Trial], findings: list[_Finding], round_: int,
+    ledger: Ledger, settings: RgbdLoopSettings,
+) -> Constraints:  # fmt: skip
+    """Hold findings, `constraints`, against the graph and each other, record all, and return those that pass."""
     reasons = [finding.reason for finding in findings]
     covariance = factored_marginals(graph).relative(constraints.i, constraints.j)
     predicted = SE3.between(graph.poses[constraints.i], graph.poses[constraints.j])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
 
@@ -17,6 +17,8 @@ from posegraph_slam.execution import Executor
 from posegraph_slam.geometry import SE3
 from posegraph_slam.jit import kernel
 from posegraph_slam.loop_closure.appearance import appearance_similarity
+from posegraph_slam.loop_closure.rgbd_lag import loosened
+from posegraph_slam.pose_graph.graph import Constraints
 from posegraph_slam.registration.features import Features, detect_features
 from posegraph_slam.registration.rgbd_frame import RgbdFrame, RgbdReference, prepare_reference
 from posegraph_slam.settings import Settings
@@ -60,14 +62,32 @@ class KeyframeView:
 class KeyframeViews:
     """The keyframes of a log by number: small parts in memory, prepared images read again when they are needed."""
 
-    def __init__(self, frames: Callable[[int], RgbdFrame], keyframes: IntArray, executor: Executor) -> None:
+    def __init__(
+        self,
+        frames: Callable[[int], RgbdFrame],
+        keyframes: IntArray,
+        executor: Executor,
+        *,
+        lag: FloatArray | None = None,
+    ) -> None:
+        """Read the keyframes; `lag` (K, 6) is the camera's motion between their colour and their depth."""
         self._frames, self._keyframes = frames, keyframes
+        self._lag = np.zeros((len(keyframes), 6)) if lag is None else lag
         self._kept: OrderedDict[int, RgbdReference] = OrderedDict()
         self._lock = Lock()
         self.views: list[KeyframeView] = executor.map(partial(_view_of, frames), keyframes.tolist())
 
     def __len__(self) -> int:
         return len(self._keyframes)
+
+    def believed(self, constraints: Constraints) -> Constraints:
+        """Return alignments of keyframes, each believed as far as the lag between colour and depth lets it."""
+        depth = np.array([np.median(view.sample[:, 2]) if len(view.sample) else 1.0 for view in self.views])
+        i, j = constraints.i, constraints.j
+        information = loosened(
+            constraints.information, constraints.T_i_j, self._lag[i], self._lag[j], np.maximum(depth[i], depth[j])
+        )
+        return replace(constraints, information=information)
 
     def reference(self, k: int) -> RgbdReference:
         """Return keyframe k prepared as a reference, from memory where it was used lately."""

@@ -17,6 +17,7 @@ from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_
 from posegraph_slam.geometry import SE3, Trajectory, deform
 from posegraph_slam.loop_closure.closing import LoopClosureResult
 from posegraph_slam.loop_closure.rgbd_closing import close_rgbd_loops
+from posegraph_slam.loop_closure.rgbd_lag import lag_motion
 from posegraph_slam.loop_closure.rgbd_views import KeyframeViews
 from posegraph_slam.mapping.colour_cloud import ColourCloud, ColourCloudSettings, fuse_cloud
 from posegraph_slam.mapping.surface_thickness import SurfaceCells, surface_cells, upward_direction
@@ -80,7 +81,8 @@ def optimize_rgbd(
             frames, sequence.stamps_s, settings.odometry, seed=configuration.seed, executor=executor, progress=progress
         )
     with clock.stage("loop closure"):
-        views = KeyframeViews(frames, tracked.keyframes, executor)
+        lag = lag_motion(tracked.trajectory, tracked.keyframes, sequence.depth_lag_s)
+        views = KeyframeViews(frames, tracked.keyframes, executor, lag=lag)
         closed = _close(tracked, views, configuration, executor, progress)
         optimised = deform(tracked.trajectory, tracked.keyframes, closed.graph.poses)
         parts = frame_parts(tracked, closed.graph)
@@ -131,6 +133,7 @@ def _close(
     tracked: RgbdOdometry, views: KeyframeViews, configuration: Configuration, executor: Executor, progress: Progress
 ) -> LoopClosureResult:
     chain = keyframe_chain(tracked)
+    chain = chain.with_constraints(views.believed(chain.constraints))
     if not configuration.loop_closure.enabled:
         return LoopClosureResult(graph=chain, records=(), rounds=0, solution=solve(chain, configuration.pose_graph))
     return close_rgbd_loops(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -52,18 +52,24 @@ class PinholeCamera:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RgbdSequence:
-    """Pairs of image files taken at `stamps_s` (N,), the depth registered to the colour image pixel by pixel.
+    """Pairs of image files, the depth registered to the colour image pixel by pixel.
 
-    The body that moves is the camera itself in its optical frame: x to the right, y down, z ahead.
+    The colour image was taken at `stamps_s` (N,), the depth `depth_lag_s` (N,) later; unset, at the same time. The body
+    that moves is the camera itself in its optical frame: x to the right, y down, z ahead.
     """
 
     stamps_s: FloatArray
     colour_files: tuple[Path, ...]
     depth_files: tuple[Path, ...]
     camera: PinholeCamera
+    depth_lag_s: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        lag_s = self.depth_lag_s if len(self.depth_lag_s) else np.zeros(len(self.stamps_s))
         object.__setattr__(self, "stamps_s", read_only(self.stamps_s))
+        object.__setattr__(self, "depth_lag_s", read_only(lag_s))
+        if len(self.depth_lag_s) != len(self.stamps_s):
+            raise InputError("rgbd", f"{len(self.depth_lag_s)} lags of depth for {len(self.stamps_s)} frames")
         if not len(self.stamps_s) == len(self.colour_files) == len(self.depth_files):
             raise InputError("rgbd", "stamps, colour and depth files differ in number")
 

@@ -69,6 +69,7 @@ def test_says_which_intrinsics_it_assumes(tmp_path: Path, colour: str) -> None:
     assert camera.depth_units_per_m == 1000
     assert any("no intrinsics" in remark and "32.8" in remark for remark in log.remarks)
     np.testing.assert_allclose(sequence.stamps_s, np.arange(3) / 30)
+    assert not sequence.depth_lag_s.any()
 
 
 def test_pairs_the_lists_of_the_tum_benchmark_by_time(tmp_path: Path) -> None:
@@ -80,6 +81,7 @@ def test_pairs_the_lists_of_the_tum_benchmark_by_time(tmp_path: Path) -> None:
         f"{1305031102.175 + 0.033 * k:.6f}.png" for k in (1, 2, 3)
     ]  # fmt: skip
     assert all(abs(float(d.stem) - s) < 0.005 for d, s in zip(sequence.depth_files, sequence.stamps_s, strict=True))
+    np.testing.assert_allclose(sequence.depth_lag_s, 0.004, atol=1e-6)
     assert sequence.camera.depth_units_per_m == 5000
     assert sequence.camera.fx_px == pytest.approx(517.3 / 16)
     assert any("1 of 4 colour frames" in remark for remark in log.remarks)
