@@ -45,7 +45,7 @@ class Commands(TyperGroup):
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except BrokenPipeError:
             raise
-        except (PosegraphSlamError, OSError) as error:
+        except (PosegraphSlamError, OSError, MemoryError) as error:
             if ctx.params.get("debug"):
                 typer.echo(traceback.format_exc(), err=True)
             typer.secho(f"error: {one_line(error)}", fg=typer.colors.RED, err=True)
@@ -56,6 +56,8 @@ def one_line(error: Exception) -> str:
     """Return the message of an error on one line, with the file first for errors of the system."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        return f"memory: not enough for this input ({str(error) or 'no more can be had'}); give a smaller one"
     return " ".join(str(error).split()) or type(error).__name__
 
 

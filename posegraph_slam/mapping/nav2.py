@@ -77,7 +77,9 @@ def read_nav2(path: Path) -> OccupancyGrid:
     """
     path = Path(path)
     metadata = _read_metadata(path)
-    shade, transparent = _shade(metadata.image)
+    stored = read_image(metadata.image)
+    geometry = _geometry(path, metadata, stored.shape[:2])  # before more memory is taken: it refuses huge maps
+    shade, transparent = _shade(stored)
     percent = _percent(shade, metadata)
     percent[transparent] = np.nan
     percent = percent[::-1]
@@ -85,18 +87,23 @@ def read_nav2(path: Path) -> OccupancyGrid:
     probability = np.where(observed, percent, 50.0) / 100
     with np.errstate(divide="ignore"):
         log_odds = np.log(probability) - np.log1p(-probability)
-    x, y, yaw = metadata.origin
-    geometry = GridGeometry(
-        origin_m=np.array([x, y]), resolution_m=metadata.resolution_m, shape=percent.shape, yaw_rad=yaw
-    )
     return OccupancyGrid(
         geometry=geometry, log_odds=np.clip(log_odds, -CERTAIN_LOG_ODDS, CERTAIN_LOG_ODDS), observed=observed
     )
 
 
-def _shade(image: Path) -> tuple[FloatArray, BoolArray]:
+def _geometry(path: Path, metadata: _Metadata, shape: tuple[int, ...]) -> GridGeometry:
+    x, y, yaw = metadata.origin
+    try:
+        return GridGeometry(
+            origin_m=np.array([x, y]), resolution_m=metadata.resolution_m, shape=(shape[0], shape[1]), yaw_rad=yaw
+        )
+    except InputError as error:
+        raise InputError(path, error.problem, error.remedy) from error
+
+
+def _shade(stored: ByteArray) -> tuple[FloatArray, BoolArray]:
     """Brightness (R, C) from 0 to 255, and where the image is transparent."""
-    stored = read_image(image)
     pixels = np.atleast_3d(stored).astype(np.float64) * (255 / np.iinfo(stored.dtype).max)
     opaque = pixels[..., 3] == 255 if pixels.shape[2] == 4 else np.ones(pixels.shape[:2], dtype=np.bool_)
     return pixels[..., :3].mean(axis=2), ~opaque

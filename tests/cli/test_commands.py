@@ -201,6 +201,7 @@ def test_system_errors_name_the_file() -> None:
     assert one_line(PermissionError(13, "Permission denied", "/root/x")) == "/root/x: Permission denied"
     assert one_line(OSError("two\nlines")) == "two lines"
     assert one_line(OSError()) == "OSError"
+    assert one_line(MemoryError("Unable to allocate 9 GiB")).startswith("memory: not enough for this input (Unable to")
 
 
 def test_tables_align_columns(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -220,3 +222,50 @@ def test_files_that_cannot_be_written_are_named_and_leave_the_old_ones(tmp_path)
     with pytest.raises(InputError, match="cannot be written"):
         replace_file(tmp_path / "file" / "below.npz", b"x")
     assert (tmp_path / "file").read_text() == "kept"
+
+
+def png_of_size(columns: int, rows: int) -> bytes:
+    head = b"IHDR" + struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
+    chunks = [head, b"IDAT" + zlib.compress(b"0"), b"IEND"]
+    framed = (struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"text",
+        b"\x89PNG\r\n\x1a\n",
+        png_of_size(100_000, 100_000),
+        png_of_size(0, 4),
+        b"P5\n99999 99999\n255\n",
+        b"P5\n-1 4\n255\n",
+    ],
+)
+def test_an_image_that_cannot_be_decoded_is_named(tmp_path, content, capfd):
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.png: is not an image that can be decoded"):
+        read_image(tmp_path / "a.png")
+    assert "OpenCV" not in capfd.readouterr().err
+
+
+def test_every_damaged_byte_of_a_picture_is_noticed(tmp_path, capfd):
+    path = tmp_path / "a.png"
+    write_png((np.arange(600).reshape(20, 30) % 251).astype(np.uint8), path)
+    whole = path.read_bytes()
+    for at in range(8, len(whole), 7):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
+        with pytest.raises(InputError, match=r"a\.png: is not an image"):
+            read_image(path)
+        path.write_bytes(whole[:at])
+        with pytest.raises(InputError, match=r"a\.png: is not an image"):
+            read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_map_of_too_many_cells_is_refused_by_name(tmp_path, monkeypatch):
+    yaml = write_nav2(grid_of(np.ones((5, 6))), tmp_path)
+    monkeypatch.setattr("posegraph_slam.mapping.grid.MAXIMUM_CELLS", 29)
+    with pytest.raises(InputError, match=r"map\.yaml: 5 x 6 cells"):
+        read_nav2(yaml)

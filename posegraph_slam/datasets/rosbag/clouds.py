@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from posegraph_slam.arrays import Float32Array, FloatArray
+from posegraph_slam.arrays import Float32Array, FloatArray, in_range
 from posegraph_slam.datasets.rosbag.frames import bare
 from posegraph_slam.datasets.rosbag.growing import GrowingRows
 from posegraph_slam.errors import InputError
@@ -74,7 +74,7 @@ def cloud_points(message: Any, topic: str) -> FloatArray:
     except (KeyError, ValueError) as error:
         raise InputError(topic, f"a cloud does not hold what its header says ({error})", "record it again") from error
     points = np.column_stack([values[axis].astype(np.float64) for axis in "xyz"])
-    return points[np.isfinite(points).all(axis=1)]
+    return points[in_range(points).all(axis=1)]
 
 
 def planar_slice(points: FloatArray, T_base_lidar: FloatArray) -> Float32Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, in_range
 from posegraph_slam.datasets.rosbag.growing import GrowingRows
 from posegraph_slam.geometry import Trajectory, inverse_pose, pose_from_rotation_translation
 
@@ -54,7 +54,7 @@ class FrameTree:
                 self.remarks.append(f"frame {child} has several parents ({names}): {kept} is taken")
                 parents[:] = [(0, kept)]
             rows = self._links[(parents[0][1], child)].rows.take()
-            rows = rows[np.isfinite(rows).all(axis=1) & (np.linalg.norm(rows[:, 4:], axis=1) > 1e-6)]
+            rows = rows[in_range(rows).all(axis=1) & (np.linalg.norm(rows[:, 4:], axis=1) > 1e-6)]
             if len(rows):
                 R = Rotation.from_quat(rows[:, 4:]).as_matrix()
                 self._poses[(parents[0][1], child)] = rows[:, 0], pose_from_rotation_translation(R, rows[:, 1:4])

@@ -36,7 +36,11 @@ class ImageIndex:
 
     def add(self, message: RawMessage, *, is_ros2: bool) -> None:
         """Note one image without decoding it."""
-        stamp_ns, frame = read_header(message.data, is_ros2=is_ros2)
+        try:
+            stamp_ns, frame = read_header(message.data, is_ros2=is_ros2)
+        except (struct.error, IndexError):
+            problem = f"a message of {len(message.data)} bytes is no image"
+            raise InputError(f"topic {self.topic}", problem, "the bag is damaged there: record it again") from None
         self.frame = self.frame or bare(frame)
         place = self._last[1] + 1 if self._last[0] == message.recorded_ns else 0
         self._last = (message.recorded_ns, place)
@@ -116,7 +120,10 @@ def _decompress(message: Any, where: str) -> Image:
     data: ByteArray = np.asarray(message.data, dtype=np.uint8)
     if "compressedDepth" in message.format:
         data = data[DEPTH_HEADER_BYTES:]
-    image = cv2.imdecode(np.ascontiguousarray(data), cv2.IMREAD_UNCHANGED) if len(data) else None
+    try:
+        image = cv2.imdecode(np.ascontiguousarray(data), cv2.IMREAD_UNCHANGED) if len(data) else None
+    except cv2.error:  # a size beyond its limit
+        image = None
     if image is None:
         raise InputError(where, f"cannot be decoded as {message.format}", "the bag is damaged there")
     return np.ascontiguousarray(image[..., 2::-1]) if image.ndim == 3 else np.asarray(image)

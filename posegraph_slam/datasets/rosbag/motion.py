@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posegraph_slam.arrays import FloatArray
+from posegraph_slam.arrays import FloatArray, in_range
 from posegraph_slam.datasets.rosbag.frames import bare
 from posegraph_slam.datasets.rosbag.growing import GrowingRows
 from posegraph_slam.geometry import pose_from_rotation_translation
@@ -33,7 +33,7 @@ class PoseCollector:
     def finish(self) -> tuple[FloatArray, FloatArray, FloatArray, int]:
         """Return stamps (N,), times of recording (N,), poses (N, 4, 4), and how many were not finite and left out."""
         rows = self._rows.take()
-        usable = np.isfinite(rows).all(axis=1) & (np.linalg.norm(rows[:, 5:], axis=1) > 1e-6)
+        usable = in_range(rows).all(axis=1) & (np.linalg.norm(rows[:, 5:], axis=1) > 1e-6)
         dropped = int(np.count_nonzero(~usable))
         rows = rows[usable]
         R = Rotation.from_quat(rows[:, 5:]).as_matrix() if len(rows) else np.empty((0, 3, 3))
@@ -64,6 +64,6 @@ class ImuCollector:
     def finish(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, int]:
         """Return stamps, times of recording (N,), rates and accelerations (N, 3), and how many were not finite."""
         rows = self._rows.take()
-        usable = np.isfinite(rows).all(axis=1)
+        usable = in_range(rows).all(axis=1)
         kept = rows[usable]
         return kept[:, 0], kept[:, 1], kept[:, 2:5], kept[:, 5:8], int(np.count_nonzero(~usable))
