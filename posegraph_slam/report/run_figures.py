@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
+from posegraph_slam.geometry import SE3
 from posegraph_slam.pipeline.jobs import JobResult
 from posegraph_slam.pipeline.optimize_rgbd import RgbdResult
 from posegraph_slam.pipeline.run_directory import RunDirectory
 from posegraph_slam.pose_graph.graph import ConstraintKind
 from posegraph_slam.report.figures import draw_floor, draw_map, draw_texture, draw_trajectories, loop_segments
 from posegraph_slam.report.rgbd_figures import draw_rgbd_figures
+from posegraph_slam.report.space_figure import draw_heights
 
 
 def draw_figures(result: JobResult, directory: RunDirectory) -> None:
     """Draw the trajectories of the stages, the map with its loops, the rejected ones too, and the texture if any.
 
-    Files: figures/trajectories.png, figures/map.png, figures/map_rejected.png, figures/texture.png,
-    figures/floor.png; those of an RGB-D log are in `draw_rgbd_figures`.
+    Files: figures/trajectories.png, figures/heights.png of poses in space, figures/map.png,
+    figures/map_rejected.png, figures/texture.png, figures/floor.png; those of an RGB-D log are in `draw_rgbd_figures`.
     """
     if isinstance(result, RgbdResult):
         draw_rgbd_figures(result, directory)
         return
     draw_trajectories(result.stages, directory.path("figures/trajectories.png"), truth=result.truth)
+    if result.trajectory.group is SE3:
+        draw_heights(result.stages, directory.path("figures/heights.png"), truth=result.truth)
     if result.occupancy is None:
         return
     positions = result.graph.poses[:, :-1, -1]

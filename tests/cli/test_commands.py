@@ -102,6 +102,7 @@ def test_a_world_of_ramps_is_optimised_in_space(tmp_path: Path) -> None:
     assert np.ptp(true[:, 3]) > 0.2
     assert np.abs((rows[:, 3] - rows[0, 3]) - (true[:, 3] - true[0, 3])).max() < 0.1
     assert "VERTEX_SE3:QUAT" in (run / "graph.g2o").read_text()
+    assert (run / "figures" / "heights.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     again = psg("optimize", run, "--from", "graph", "--out", tmp_path / "again", "--quiet")
     assert again.exit_code == 0, again.output
     np.testing.assert_allclose(np.loadtxt(tmp_path / "again" / "trajectory.tum"), rows, atol=1e-6)

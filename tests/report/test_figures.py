@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from posegraph_slam.geometry import SE2, Trajectory, pose_from_xyt
+from posegraph_slam.geometry import SE2, SO3, Trajectory, pose_from_rotation_translation, pose_from_xyt
 from posegraph_slam.mapping.grid import GridGeometry
 from posegraph_slam.mapping.occupancy import OccupancyGrid
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints
 from posegraph_slam.report import canvas
 from posegraph_slam.report.canvas import BLACK, BLUE, GREEN, ORANGE, SKY, round_length
 from posegraph_slam.report.figures import align_truth, draw_map, draw_texture, draw_trajectories, loop_segments
+from posegraph_slam.report.space_figure import draw_heights, height_offset, profile
 from posegraph_slam.report.view import MAXIMUM_PIXELS, View, bounds_around
 
 
@@ -52,6 +53,32 @@ def share(path: Path, colour: str, tolerance: int = 12) -> float:
         pixels = np.asarray(picture.convert("RGB"), np.int16)
     wanted = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.int16)
     return float((np.abs(pixels - wanted).max(axis=-1) <= tolerance).mean())
+
+
+def climb(lift_m: float = 0.0, first: int = 0) -> Trajectory:
+    """Up a ramp of 0.2 rad at 1 m/s and on, rolling by 0.05 rad."""
+    t = 0.1 * np.arange(first, 100)
+    pitch = np.where(t < 5, -0.2, 0.0)
+    height = 0.2 * np.minimum(t, 5.0) + lift_m
+    R = SO3.exp(pitch[:, None] * [0, 1, 0]) @ SO3.exp(np.tile([0.05, 0.0, 0.0], (len(t), 1)))
+    poses = pose_from_rotation_translation(R, np.stack([t, 0 * t, height], axis=1))
+    return Trajectory(stamps_s=t, poses=poses, parent="map", child="base")
+
+
+@pytest.mark.usefixtures("full_resolution")
+def test_heights_show_what_the_plan_view_does_not(tmp_path: Path, path_xyt: np.ndarray) -> None:
+    height, roll, pitch = profile(climb())
+    assert height[-1] == pytest.approx(1.0)
+    np.testing.assert_allclose(roll, np.degrees(0.05), atol=1e-9)
+    np.testing.assert_allclose(pitch[[0, -1]], [-np.degrees(0.2), 0.0], atol=1e-9)
+    assert not profile(trajectory(path_xyt)).any()
+    assert height_offset(climb(), climb(lift_m=3.0, first=20)) == pytest.approx(-3.0)
+    stages = {"odometry": trajectory(path_xyt), "optimised": climb()}
+    for name in ("a.png", "b.png"):
+        draw_heights(stages, tmp_path / name, truth=climb(lift_m=3.0))
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert share(tmp_path / "a.png", BLUE) > 0.001
+    assert share(tmp_path / "a.png", SKY) > 0.0005
 
 
 @pytest.mark.usefixtures("full_resolution")

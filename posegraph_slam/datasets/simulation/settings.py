@@ -53,7 +53,10 @@ class WorldSettings(Settings):
         length = self.ramps.rise_max_m / float(np.tan(np.radians(self.ramps.slope_min_deg)))
         room = 2 * (self.room_depth_m - LANDING_M)
         if self.kind == "ramps" and length > room:
-            raise ValueError(f"a ramp of {length:.1f} m does not fit into the {room:.1f} m between two corridors")
+            raise ValueError(
+                f"a ramp of {length:.1f} m does not fit into the {room:.1f} m between two corridors; lower rise_max_m, "
+                "raise slope_min_deg or room_depth_m"
+            )
         return self
 
 
