@@ -143,10 +143,18 @@ def _summed(keys: IntArray, sums: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _merged(cloud: _Voxels, part: _Voxels, most: int) -> _Voxels:
-    """Add a part to the cloud; double the side of all voxels until there are few enough."""
+    """Add a part to the cloud, whose sums change in place; double the side of all voxels until they are few enough.
+
+    Voxels that both know are added to, the others put between: the cloud is copied once, and never sorted again.
+    """
     while part.doublings < cloud.doublings:
         part = _doubled(part)
-    keys, sums = _summed(np.concatenate([cloud.keys, part.keys]), np.concatenate([cloud.sums, part.sums]))
+    place = np.searchsorted(cloud.keys, part.keys)
+    known = place < len(cloud.keys)
+    known[known] = cloud.keys[place[known]] == part.keys[known]
+    cloud.sums[place[known]] += part.sums[known]
+    keys = np.insert(cloud.keys, place[~known], part.keys[~known])
+    sums = np.insert(cloud.sums, place[~known], part.sums[~known], axis=0)
     merged = _Voxels(keys=keys, sums=sums, doublings=cloud.doublings)
     while len(merged.keys) > most and merged.doublings < AXIS_BITS - 1:
         merged = _doubled(merged)

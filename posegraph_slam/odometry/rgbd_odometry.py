@@ -52,7 +52,8 @@ class _Pieces:
     seed: int
     left: list[RgbdTracker] = field(default_factory=list)
     open: list[RgbdTracker] = field(default_factory=list)
-    problem: str = ""
+    problems: dict[int, str] = field(default_factory=dict)
+    """Why frames fitted no place that was open to them."""
 
     def track(self, k: int, frame: RgbdFrame) -> None:
         """Find frame k in the oldest piece that it fits, or begin a new piece with it."""
@@ -62,7 +63,7 @@ class _Pieces:
                 piece.accept(k, frame, found)
                 self.return_to(place, k, frame)
                 break
-            self.problem = self.problem or found.problem
+            self.problems.setdefault(k, found.problem)
         else:
             if len(self.open) > 1 and len(self.open[-1]) == 1:
                 self.open.pop()  # neither those before nor this one fit it
@@ -84,7 +85,7 @@ class _Pieces:
         if not pieces:
             raise InputError(
                 "rgbd",
-                f"no frame can be aligned to another ({self.problem})",
+                f"no frame can be aligned to another ({next(iter(self.problems.values()), '')})",
                 "check intrinsics, depth unit, and that the frames overlap",
             )
         for piece in pieces:
@@ -117,10 +118,10 @@ def track_rgbd(
         for k, frame in enumerate(executor.map(frames, range(start + 1, stop + 1)), start=start + 1):
             pieces.track(k, frame)
         progress("odometry", stop, count - 1)
-    return _result(pieces.finished(), np.asarray(stamps_s, dtype=np.float64), pieces.problem)
+    return _result(pieces.finished(), np.asarray(stamps_s, dtype=np.float64), pieces.problems)
 
 
-def _result(pieces: list[RgbdTracker], stamps_s: FloatArray, problem: str) -> RgbdOdometry:
+def _result(pieces: list[RgbdTracker], stamps_s: FloatArray, problems: dict[int, str]) -> RgbdOdometry:
     """Put pieces one behind the other: each begins where the one before was seen last, which is a guess."""
     s = pieces[0].settings
     guess = np.diag(np.repeat([s.lost_sigma_rad, s.lost_sigma_m], 3) ** -2.0)
@@ -147,7 +148,7 @@ def _result(pieces: list[RgbdTracker], stamps_s: FloatArray, problem: str) -> Rg
         information=np.stack(information),
         guessed=np.array(guessed),
         tracked=tracked,
-        remarks=_remarks(tracked, np.array(keyframes)[1:][guessed], problem),
+        remarks=_remarks(tracked, np.array(keyframes)[1:][guessed], problems),
     )
 
 
@@ -160,14 +161,13 @@ def _filled(known: IntArray, poses: FloatArray, stamps_s: FloatArray) -> Traject
     return Trajectory(stamps_s=stamps_s, poses=filled, parent="odom", child="camera")
 
 
-def _remarks(tracked: BoolArray, after_guess: IntArray, problem: str) -> tuple[str, ...]:
+def _remarks(tracked: BoolArray, after_guess: IntArray, problems: dict[int, str]) -> tuple[str, ...]:
     remarks = []
     lost = int(np.count_nonzero(~tracked))
     if lost:
         first = int(np.argmin(tracked))
-        remarks.append(
-            f"{lost} frames could not be aligned (first frame {first}: {problem}); their poses are interpolated"
-        )
+        why = f": {problems[first]}" if first in problems else ""  # the first frame of all is no failure by itself
+        remarks.append(f"{lost} frames could not be aligned (first frame {first}{why}); their poses are interpolated")
     if len(after_guess):
         at = ", ".join(map(str, after_guess[:5].tolist()))
         remarks.append(f"tracking was lost before frame {at}: the motion there is a guess until a loop closes over it")

@@ -182,8 +182,10 @@ def _described(
     problem, status = "", RegistrationStatus.CONVERGED if settled else RegistrationStatus.MAX_ITERATIONS
     if total[0] < LEAST_POINTS:
         status, problem = RegistrationStatus.TOO_FEW_POINTS, f"{int(total[0])} points with depth"
-    elif overlap < settings.overlap_min or total[6] < LEAST_POINTS:
+    elif overlap < settings.overlap_min:
         status, problem = RegistrationStatus.TOO_FEW_INLIERS, f"too little overlap: {overlap:.2f}"
+    elif total[6] < LEAST_POINTS:
+        status, problem = RegistrationStatus.TOO_FEW_INLIERS, f"{int(total[6])} points find depth in the other frame"
     elif agreement < settings.agreement_min:
         status, problem = RegistrationStatus.TOO_FEW_INLIERS, f"surfaces in free space: agreement {agreement:.2f}"
     elif fraction < settings.inlier_fraction_min:

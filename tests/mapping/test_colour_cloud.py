@@ -67,6 +67,14 @@ def test_neither_order_nor_workers_change_a_byte() -> None:
         assert other.colours.tobytes() == one.colours.tobytes()
 
 
+def test_every_point_of_every_frame_counts_once() -> None:
+    settings = ColourCloudSettings(voxel_m=0.05, points_min=1)
+    cloud = fuse_cloud(wall(2.0), steps(40, 0.07), CAMERA, settings, depth_units_per_m=1000)
+    assert cloud.counts.sum() == 40 * 78 * 58
+    keys = np.floor(cloud.points / 0.05).astype(int)
+    assert len(np.unique(keys, axis=0)) == len(cloud), "one point a voxel"
+
+
 def test_voxels_are_widened_to_bound_memory() -> None:
     fine = ColourCloudSettings(voxel_m=0.01, voxels_max=1000, points_min=1)
     cloud = fuse_cloud(wall(2.0), steps(3), CAMERA, fine, depth_units_per_m=1000)
