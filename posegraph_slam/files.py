@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from posegraph_slam.errors import InputError
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of writing, which the system reports without a name."""
+
+
+def name_target(error: OSError, temporary: Path, path: Path) -> None:
+    """Make an error of writing `temporary`, a file or folder, name `path`, which was asked for."""
+    name, start = str(error.filename or ""), str(temporary)
+    if name.startswith(start):
+        error.filename, error.filename2 = f"{path}{name[len(start) :]}", None
+    elif not name and error.errno in NO_SPACE:
+        error.filename = str(path)
 
 
 @contextmanager
@@ -25,8 +38,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename == str(temporary):
-            error.filename, error.filename2 = str(path), None
+        name_target(error, temporary, path)
         raise
     finally:
         temporary.unlink(missing_ok=True)

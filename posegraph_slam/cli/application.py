@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 import warnings
+from io import TextIOWrapper
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -31,6 +32,8 @@ from posegraph_slam.cli import (
 from posegraph_slam.errors import PosegraphSlamError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+LINE_MAX = 3000
+"""Characters of an error at most; the longest of our own, that no reader recognises a log, has half as many."""
 
 
 class Commands(TyperGroup):
@@ -58,7 +61,10 @@ def one_line(error: Exception) -> str:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):
         return f"memory: not enough for this input ({str(error) or 'no more can be had'}); give a smaller one"
-    return " ".join(str(error).split()) or type(error).__name__
+    line = " ".join(str(error).split()) or type(error).__name__
+    if len(line) > LINE_MAX:  # it quotes what it read, which may be a whole file: keep where, what and the remedy
+        return f"{line[: LINE_MAX // 2]} ... {line[-LINE_MAX // 2 :]}"
+    return line
 
 
 def show_version(wanted: bool) -> None:
@@ -114,6 +120,9 @@ app.add_typer(configuration.app, name="config", short_help="List presets, show t
 def main() -> None:
     """Run the command line."""
     warnings.showwarning = _show_warning
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # names and signs that a terminal cannot show must not end a command
+            stream.reconfigure(errors="backslashreplace")
     app()
 
 

@@ -11,6 +11,7 @@ from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.datasets.ece276a import METRES_PER_TICK, TRACK_WIDTH_M
 from posegraph_slam.datasets.tum import write_tum
 from posegraph_slam.errors import InputError
+from posegraph_slam.files import name_target
 from posegraph_slam.geometry import SE2, Trajectory
 from posegraph_slam.sensors import STANDARD_GRAVITY, Imu, LaserScans, RgbdFrames, RobotLog, WheelEncoders
 
@@ -45,6 +46,9 @@ def write_ece276a(log: RobotLog, folder: Path, odometry: Trajectory) -> list[str
         if folder.exists():
             shutil.rmtree(folder)
         unfinished.rename(folder)
+    except OSError as error:
+        name_target(error, unfinished, folder)
+        raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     if log.relations is not None:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from posegraph_slam.errors import InputError
+from posegraph_slam.files import name_target
 from posegraph_slam.sensors import RobotLog
 from posegraph_slam.sensors.images import Image, ImageStream
 
@@ -52,6 +53,9 @@ def write_rgbd(log: RobotLog, folder: Path) -> tuple[int, list[str]]:
         if folder.exists():
             shutil.rmtree(folder)
         unfinished.rename(folder)
+    except OSError as error:
+        name_target(error, unfinished, folder)
+        raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     return len(depth), remarks

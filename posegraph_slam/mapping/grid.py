@@ -9,6 +9,7 @@ import numpy as np
 from posegraph_slam.arrays import BoolArray, FloatArray, IntArray, read_only
 from posegraph_slam.errors import InputError
 
+SMALLEST_CELL_M, LARGEST_CELL_M = 1e-6, 1e6
 MAXIMUM_CELLS = 100_000_000
 """Largest grid: at 13 bytes a cell while it is built, 1.3 GB; 500 x 500 m at 0.05 m."""
 
@@ -33,8 +34,9 @@ class GridGeometry:
             raise InputError(
                 "grid geometry", f"origin {self.origin_m} must be two finite numbers and yaw {self.yaw_rad} finite"
             )
-        if not (np.isfinite(self.resolution_m) and self.resolution_m > 0):
-            raise InputError("grid geometry", f"resolution {self.resolution_m} m must be positive")
+        if not SMALLEST_CELL_M <= self.resolution_m <= LARGEST_CELL_M:
+            problem = f"resolution {self.resolution_m} m is not between {SMALLEST_CELL_M:g} and {LARGEST_CELL_M:g} m"
+            raise InputError("grid geometry", problem, "it must be positive, in metres a cell")
         if rows < 1 or columns < 1 or rows * columns > MAXIMUM_CELLS:
             size = f"{columns * self.resolution_m:.0f} x {rows * self.resolution_m:.0f} m"
             raise InputError(

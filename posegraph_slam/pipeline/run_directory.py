@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from posegraph_slam.errors import InputError
-from posegraph_slam.files import replacing
+from posegraph_slam.files import name_target, replacing
 from posegraph_slam.pipeline.configuration import Configuration, load_configuration
 from posegraph_slam.pipeline.run_forms import MetricsForm, RecordForm, read_form
 from posegraph_slam.pipeline.settings_files import to_toml
@@ -46,9 +46,9 @@ class RunDirectory:
         return path
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a text file as UTF-8."""
+        """Write a text file as UTF-8; bytes of file names that are no text become \\udcXX, as JSON escapes them."""
         with replacing(self.path(name)) as temporary:
-            temporary.write_text(text, encoding="utf-8", newline="\n")
+            temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
 
     def write_json(self, name: str, value: object) -> None:
         """Write records, arrays and numbers as JSON; what is not finite becomes null."""
@@ -131,6 +131,9 @@ def create_run_directory(path: Path, *, overwrite: bool = False) -> Iterator[Run
         yield RunDirectory(partial)
         require_free(path, overwrite=overwrite)
         _publish(partial, path)
+    except OSError as error:
+        name_target(error, partial, path)
+        raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

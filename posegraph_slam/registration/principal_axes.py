@@ -16,10 +16,13 @@ LINE_TOLERANCE = 1e-12
 def axes_of_all(points: FloatArray, neighbours: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Means and normals (m, d) of neighbourhoods (m, k), rows of the points (n, d), and their variances (m, 3).
 
-    The variances are the least, the second and the largest; in the plane the second is the largest.
+    The variances are the least, the second and the largest; in the plane the second is the largest. Everything is zero
+    where neighbourhoods are empty (k = 0).
     """
     count, d = len(neighbours), points.shape[1]
-    means, normals, variances = np.empty((count, d)), np.empty((count, d)), np.empty((count, 3))
+    means, normals, variances = np.zeros((count, d)), np.zeros((count, d)), np.zeros((count, 3))
+    if neighbours.shape[1] == 0:
+        return means, normals, variances
     for row in range(count):
         least, second, largest = fit_principal_axes(points, neighbours, row, means, normals)
         variances[row, 0], variances[row, 1], variances[row, 2] = max(least, 0.0), second, largest

@@ -58,7 +58,7 @@ def fit_surface(points: FloatArray, tree: KdTree, neighbours: int) -> Surface:
     than their noise, those that err towards the source, and would be drawn to its own guess. Where a mean leaves a
     curved surface, the anchor is moved back to it. In the plane, neighbourhoods that are thick for their length
     (1081 beams with 3 cm noise) are doubled, up to four times. In space, those that lie on one line of a scan are
-    taken from farther around (`widen_rows`).
+    taken from farther around (`widen_rows`). A cloud of fewer than d points has no neighbourhoods and no normals.
     """
     n, d = points.shape
     count = min(neighbours, n) if n >= d else 0

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from posegraph_slam.errors import InputError
-from posegraph_slam.files import replacing
+from posegraph_slam.files import name_target, replacing
 
 
 def test_a_file_appears_when_the_block_ends_well(tmp_path: Path) -> None:
@@ -36,3 +38,19 @@ def test_errors_of_the_system_name_the_file_and_not_the_temporary_one(tmp_path: 
     with pytest.raises(OSError, match="too long") as caught, replacing(path) as temporary:
         temporary.write_text("x")
     assert caught.value.filename == str(path)
+
+
+def test_a_full_disk_names_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with pytest.raises(OSError, match="No space") as caught, replacing(path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert caught.value.filename == str(path)
+
+
+def test_errors_inside_a_temporary_folder_name_the_place_in_the_final_one() -> None:
+    error = OSError(errno.ENOSPC, "full", "/out/.run.partial-1/maps/map.png")
+    name_target(error, Path("/out/.run.partial-1"), Path("/out/run"))
+    assert error.filename == "/out/run/maps/map.png"
+    other = PermissionError(errno.EACCES, "denied", "/log")
+    name_target(other, Path("/out/.run.partial-1"), Path("/out/run"))
+    assert other.filename == "/log"

@@ -202,6 +202,10 @@ def test_system_errors_name_the_file() -> None:
     assert one_line(PermissionError(13, "Permission denied", "/root/x")) == "/root/x: Permission denied"
     assert one_line(OSError("two\nlines")) == "two lines"
     assert one_line(OSError()) == "OSError"
+    long = one_line(OSError("a.tum: " + "9" * 100_000 + "; correct it"))
+    assert long.startswith("a.tum: 9")
+    assert long.endswith("9; correct it")
+    assert len(long) < 4000
     assert one_line(MemoryError("Unable to allocate 9 GiB")).startswith("memory: not enough for this input (Unable to")
 
 

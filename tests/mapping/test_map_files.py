@@ -269,3 +269,11 @@ def test_a_map_of_too_many_cells_is_refused_by_name(tmp_path, monkeypatch):
     monkeypatch.setattr("posegraph_slam.mapping.grid.MAXIMUM_CELLS", 29)
     with pytest.raises(InputError, match=r"map\.yaml: 5 x 6 cells"):
         read_nav2(yaml)
+
+
+@pytest.mark.parametrize("resolution", ["1e-320", "1e300", "1.0e-7"])
+def test_cells_of_no_sensible_size_are_refused(tmp_path, resolution):
+    yaml = write_nav2(grid_of(np.ones((5, 6))), tmp_path)
+    yaml.write_text(re.sub(r"resolution: .*", f"resolution: {resolution}", yaml.read_text()))
+    with pytest.raises(InputError, match=r"map\.yaml: resolution .* is not between 1e-06 and 1e\+06 m"):
+        read_nav2(yaml)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import subprocess
 import sys
 from enum import StrEnum
@@ -219,3 +220,11 @@ def test_peak_memory_follows_what_is_allocated() -> None:
     assert 10 < before < 1000
     assert before + 60 <= after < 3 * before + 100
     assert first == 1
+
+
+def test_names_that_are_no_text_are_recorded(tmp_path: Path) -> None:
+    name = os.fsdecode(b"log\xff.clf")
+    with create_run_directory(tmp_path / "run") as run:
+        run.write_configuration(Configuration())
+        run.write_json("run.json", {"format_version": 1, "input": {"path": name}})
+    assert read_run_directory(tmp_path / "run").record["input"]["path"] == name

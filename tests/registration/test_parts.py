@@ -206,3 +206,17 @@ def test_a_cloud_too_wide_for_its_gate_is_refused() -> None:
     wide = prepare_cloud(np.array([[0.0, 0], [1e7, 0], [0, 1]]))
     with pytest.raises(InputError, match="KD-tree"):
         by_voxel_hash(wide, 0.1)
+
+
+@spaces
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_clouds_of_a_few_points_have_a_surface_without_normals(group: Group, count: int) -> None:
+    points = np.random.default_rng(count).normal(size=(count, group.dimension))
+    surface = prepare_cloud(points).surface
+    assert len(surface.anchors) == len(surface.normals) == count
+    if count < group.dimension:
+        np.testing.assert_array_equal(surface.anchors, points)
+        assert not surface.oriented.any()
+        assert surface.neighbours.shape == (count, 0)
+    repeated = prepare_cloud(np.repeat(points[:1], 50, axis=0)).surface
+    assert not repeated.oriented.any()

@@ -19,6 +19,7 @@ from posegraph_slam.datasets.simulation.settings import SimulationSettings
 from posegraph_slam.datasets.tum import write_tum
 from posegraph_slam.errors import InputError
 from posegraph_slam.execution import Progress, silent_progress
+from posegraph_slam.files import name_target
 from posegraph_slam.sensors import DisparityCalibration
 
 FAST_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)
@@ -49,6 +50,9 @@ def simulate(
         if folder.exists():
             shutil.rmtree(folder)
         os.replace(unfinished, folder)
+    except OSError as error:
+        name_target(error, unfinished, folder)
+        raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     return folder
