@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from posegraph_slam.arrays import FloatArray, IntArray
+from posegraph_slam.arrays import BoolArray, FloatArray, IntArray
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
 from posegraph_slam.geometry import SE3
 from posegraph_slam.loop_closure.closing import LoopClosureResult, settle
@@ -21,7 +21,13 @@ from posegraph_slam.loop_closure.rgbd_views import (
     propose_overlapping,
 )
 from posegraph_slam.loop_closure.settings import VerificationSettings
-from posegraph_slam.loop_closure.verification import count_support, first_reasons, gaussian_sigmas, passing
+from posegraph_slam.loop_closure.verification import (
+    NEIGHBOURHOOD_M,
+    count_support,
+    first_reasons,
+    gaussian_sigmas,
+    passing,
+)
 from posegraph_slam.pose_graph.graph import ConstraintKind, Constraints, PoseGraph
 from posegraph_slam.pose_graph.marginals import factored_marginals
 from posegraph_slam.pose_graph.solve import solve
@@ -200,7 +206,10 @@ def _verify(
 ) -> Constraints:  # fmt: skip
     """Hold findings, `constraints`, against the graph and each other, record all, and return those that pass."""
     reasons = [finding.reason for finding in findings]
-    covariance = factored_marginals(graph).relative(constraints.i, constraints.j)
+    marginals = factored_marginals(graph)
+    covariance = marginals.relative(constraints.i, constraints.j)
+    first = np.arange(len(graph) - 1)
+    broken = _unsure(marginals.relative(first, first + 1), settings)
     predicted = SE3.between(graph.poses[constraints.i], graph.poses[constraints.j])
     error = SE3.local(predicted, constraints.T_i_j)
     total = covariance + np.linalg.inv(constraints.information)
@@ -208,7 +217,7 @@ def _verify(
     sigmas = np.where(passing(reasons), gaussian_sigmas(squared, SE3.dof), np.nan)
     surprise = [f"would move the graph by {s:.1f} sigma" if s > settings.sigma_max else "" for s in sigmas.tolist()]
     reasons = first_reasons(reasons, surprise)
-    reasons = first_reasons(reasons, _support(graph, constraints, findings, covariance, reasons, settings))
+    reasons = first_reasons(reasons, _support(graph, constraints, findings, covariance, broken, reasons, settings))
     path_m = _path(graph.poses)
     for m, (trial, finding) in enumerate(zip(trials, findings, strict=True)):
         ledger.enter(_record(trial, finding, round_, error[m], float(sigmas[m]), reasons[m], path_m))
@@ -216,19 +225,21 @@ def _verify(
 
 
 def _support(
-    graph: PoseGraph, constraints: Constraints, findings: list[_Finding], covariance: FloatArray, reasons: list[str],
-    settings: RgbdLoopSettings,
+    graph: PoseGraph, constraints: Constraints, findings: list[_Finding], covariance: FloatArray, broken: BoolArray,
+    reasons: list[str], settings: RgbdLoopSettings,
 ) -> list[str]:  # fmt: skip
-    """Say for each closure that others disagree, or that none agrees where the estimate tells little; or nothing."""
-    sigma_rad = np.sqrt(np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1])
-    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
-    unsure = (sigma_m > settings.trusted_sigma_m) | (sigma_rad > settings.trusted_sigma_rad)
+    """Say for each closure that others disagree, or that none agrees where the estimate tells little; or nothing.
+
+    Where the motion from a keyframe to the next is `broken` (K-1,), hardly known, no loop through two closures is
+    held to close: those on either side are no neighbours.
+    """
+    unsure = _unsure(covariance, settings)
     count = len(constraints)
     candidates = Candidates(
         target=constraints.i, source=constraints.j, kind=constraints.kind, travel_m=np.zeros(count),
         reach_m=np.zeros(count), reach_rad=np.zeros(count),
     )  # fmt: skip
-    along = np.arange(len(graph), dtype=np.float64) * KEYFRAME_M
+    along = np.concatenate([[0.0], np.cumsum(KEYFRAME_M + 2 * NEIGHBOURHOOD_M * broken)])
     agree, disagree = count_support(candidates, constraints.T_i_j, graph.poses, along, passing(reasons), SUPPORT)
     result = [""] * count
     for m in range(count):
@@ -237,6 +248,13 @@ def _support(
         elif unsure[m] and agree[m] == 0 and findings[m].inliers < settings.features_alone:
             result[m] = f"the estimate is unsure here, no other closure agrees, and {findings[m].inliers} features do"
     return result
+
+
+def _unsure(covariance: FloatArray, settings: RgbdLoopSettings) -> BoolArray:
+    """Which motions (M,) the estimate hardly knows, by their covariance (M, 6, 6)."""
+    sigma_rad = np.sqrt(np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1])
+    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1])
+    return np.asarray((sigma_m > settings.trusted_sigma_m) | (sigma_rad > settings.trusted_sigma_rad))
 
 
 def _path(poses: FloatArray) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -61,6 +63,24 @@ def drifting_chain(step: FloatArray, *, sigma_m: float = 0.02, sigma_rad: float 
 def worst(poses: FloatArray) -> float:
     relative = SE3.local(SE3.between(POSES[:1], POSES), SE3.between(poses[:1], poses))
     return float(np.linalg.norm(relative[:, 3:], axis=1).max())
+
+
+def test_parts_whose_motion_is_a_guess_are_joined_where_they_see_the_same(views: KeyframeViews) -> None:
+    chain = drifting_chain(np.zeros(6))
+    lost = 14
+    T, information = chain.constraints.T_i_j.copy(), chain.constraints.information.copy()
+    T[lost], information[lost] = np.eye(4), np.eye(6)
+    poses = [np.eye(4)]
+    for step in T:
+        poses.append(poses[-1] @ step)
+    constraints = replace(chain.constraints, T_i_j=T, information=information)
+    chain = chain.with_constraints(constraints).with_poses(np.stack(poses))
+    assert worst(chain.poses) > 0.1
+    result = close_rgbd_loops(chain, views, RgbdLoopSettings(), SOLVER)
+    within = [r for r in result.records if r.accepted and (r.source <= lost or r.target > lost)]
+    assert within, "closures within a part, whose loops with those across would lead over the guess"
+    assert any(r.accepted for r in result.records if r.target <= lost < r.source)
+    assert worst(result.graph.poses) < 0.05
 
 
 def test_closing_the_round_takes_out_the_drift(views: KeyframeViews) -> None:
