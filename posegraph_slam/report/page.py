@@ -24,7 +24,8 @@ def write_report(run: Path, out: Path | None = None, *, name: str | None = None)
     path = out or run / REPORT
     text = report_page(read_run_content(run, name=name))
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        # names of files that are no text show a question mark
+        temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
     return path
 
 

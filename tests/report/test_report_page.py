@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shutil
 from html.parser import HTMLParser
@@ -97,6 +98,11 @@ def test_report_of_a_run_has_the_bytes_that_the_run_wrote(small_run: Path, tmp_p
     again = write_report(small_run, tmp_path / "report.html")
     assert again.read_bytes() == (small_run / "report.html").read_bytes()
     assert again.stat().st_size < 400_000
+
+
+def test_names_that_are_no_text_do_not_keep_a_report_from_being_written(small_run: Path, tmp_path: Path) -> None:
+    out = write_report(small_run, tmp_path / "report.html", name=os.fsdecode(b"log\xff"))
+    assert "log?" in out.read_text(encoding="utf-8")
 
 
 def test_texts_from_files_and_names_cannot_become_markup(hostile_run: Path) -> None:
