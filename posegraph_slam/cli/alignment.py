@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from posegraph_slam.cli.arguments import Json, Overwrite, Quiet, Verbose
-from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table, print_warning
+from posegraph_slam.cli.console import ProgressBars, print_json, print_note, print_table
 
 if TYPE_CHECKING:
     from posegraph_slam.pipeline.object_poses import AlignedObject, ObjectPose
@@ -95,12 +95,16 @@ def icp(
 
 
 def finish(poses: list[ObjectPose]) -> None:
-    """End with exit code 2 if some cloud found no pose."""
+    """Raise InputError, after all that was found is printed and written, if some cloud found no pose."""
+    from posegraph_slam.errors import InputError
+
     lost = [pose for pose in poses if pose.fit is None]
-    for pose in lost:
-        print_warning(f"{pose.cloud}: no pose ({pose.registration.result.status})")
     if lost:
-        raise typer.Exit(2)
+        others = f", nor is there one of {len(lost) - 1} others" if len(lost) > 1 else ""
+        problem = f"no pose ({lost[0].registration.result.status}){others}"
+        raise InputError(
+            lost[0].cloud, problem, "check that it shows the model, and try more --rotations or less --keep"
+        )
 
 
 def draw_pictures(objects: list[AlignedObject], out: Path) -> None:
