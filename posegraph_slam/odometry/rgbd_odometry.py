@@ -170,5 +170,5 @@ def _remarks(tracked: BoolArray, after_guess: IntArray, problems: dict[int, str]
         remarks.append(f"{lost} frames could not be aligned (first frame {first}{why}); their poses are interpolated")
     if len(after_guess):
         at = ", ".join(map(str, after_guess[:5].tolist()))
-        remarks.append(f"tracking was lost before frame {at}: the motion there is a guess until a loop closes over it")
+        remarks.append(f"tracking was lost before frame {at}: the motion there is a guess of odometry")
     return tuple(remarks)

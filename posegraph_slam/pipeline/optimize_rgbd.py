@@ -100,7 +100,7 @@ def optimize_rgbd(
         table, metrics = _compared(stages, log.truth, cells, gaps)
         upward = upward_direction(cells["optimised"], -stages["optimised"].poses[:, :3, 1].mean(axis=0))
     notes = (*_without_replaced(log.remarks, bool(remarks)), *remarks)
-    warnings = (*tracked.remarks, *parts.remarks(), *_warnings(closed, cloud, settings.cloud))
+    warnings = (*tracked.remarks, *parts.remarks(int(tracked.guessed.sum())), *_warnings(closed, cloud, settings.cloud))
     return RgbdResult(
         stages=stages,
         odometry=tracked,

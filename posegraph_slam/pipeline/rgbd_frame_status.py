@@ -53,10 +53,10 @@ class FrameParts:
             for part, key in zip(self.part.tolist(), self.is_key.tolist(), strict=True)
         ]
 
-    def remarks(self) -> tuple[str, ...]:
-        """Say which frames do not hang together with the largest part."""
+    def remarks(self, guesses: int) -> tuple[str, ...]:
+        """Say whether all frames hang together in spite of `guesses` motions that are not known, or which do not."""
         if self.count < 2:
-            return ()
+            return ("loop closures tie what was tracked before and after it together again",) if guesses else ()
         apart = np.flatnonzero(self.part > 0)
         return (
             f"{len(apart)} frames from {apart[0]} on hang together with no others ({self.count} parts, frames.csv): no "

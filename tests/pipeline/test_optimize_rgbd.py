@@ -104,6 +104,19 @@ def test_a_part_that_no_loop_ties_to_the_rest_is_left_out_and_named(tmp_path: Pa
     assert (world < furnished_room(seed=3).boxes[0, 3:] + 0.1).all()
 
 
+def test_parts_that_loops_tie_together_are_one(tmp_path: Path) -> None:
+    path = loop_through_room(160)
+    # away at once, where nothing is known, and slowly back to what was seen first
+    poses = np.concatenate([path[:8], path[40:4:-2]])
+    folder = write_rgbd_log(tmp_path / "log", furnished_room(seed=3), small_camera(240, 180), poses)
+    result = optimize_rgbd(read(folder), load_configuration(["default"], ["rgbd.odometry.lost_frames_max=3"]))
+    assert result.metrics["guessed_motions"] == 1
+    assert not result.parts.part.any(), "one part of all frames"
+    assert any("tie what was tracked" in remark for remark in result.remarks)
+    off = SE3.local(SE3.between(poses[:1], poses), result.trajectory.poses)
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.03
+
+
 def test_a_second_run_with_two_workers_gives_the_same_bytes(finished: Path, log: Path, tmp_path: Path) -> None:
     out = tmp_path / "again"
     run(log, load_configuration(["default"], ["workers=2"]), out=out)
