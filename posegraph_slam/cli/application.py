@@ -32,8 +32,8 @@ from posegraph_slam.cli import (
 from posegraph_slam.errors import PosegraphSlamError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
-LINE_MAX = 3000
-"""Characters of an error at most; the longest of our own, that no reader recognises a log, has half as many."""
+LINE_MAX = 1000
+"""Characters of an error at most; our own are shorter, but they quote names and what others raise."""
 
 
 class Commands(TyperGroup):

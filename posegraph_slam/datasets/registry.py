@@ -167,9 +167,9 @@ def _named(name: str, readers: tuple[Reader, ...]) -> Reader:
 
 
 def _choose(path: Path, readers: tuple[Reader, ...]) -> Reader:
-    """Find the first reader that recognises `path`, or list what could have been read."""
+    """Find the first reader that recognises `path`, or name the formats that could have been read."""
     for reader in readers:
         if reader.detects(path):
             return reader
-    formats = "; ".join(f"{reader.name}: {reader.layout}" for reader in readers)
-    raise InputError(path, "no reader recognises it", f"name the format, or give one of these: {formats}")
+    formats = ", ".join(reader.name for reader in readers)
+    raise InputError(path, "no reader recognises it", f"`psg datasets` says what each of them reads: {formats}")

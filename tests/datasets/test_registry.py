@@ -68,13 +68,13 @@ def test_an_empty_folder_is_named(tmp_path: Path) -> None:
         datasets.read(tmp_path)
 
 
-def test_what_nothing_recognises_lists_the_formats(tmp_path: Path) -> None:
+def test_what_nothing_recognises_names_the_formats(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("A page about FLASER messages.\n")
     with pytest.raises(InputError) as caught:
         datasets.read(path)
     assert "no reader recognises it" in str(caught.value)
-    assert all(f"{reader.name}: {reader.layout}" in str(caught.value) for reader in registry.BUILT_IN)
+    assert all(reader.name in str(caught.value) for reader in registry.BUILT_IN)
 
 
 @pytest.mark.parametrize(("given", "meant"), [("karmen", "carmen"), ("ECE276", "ece276a")])
