@@ -97,6 +97,8 @@ def show(found: Evaluation) -> None:
         scale = f", scale {found.ape.scale:.6f}" if found.ape.alignment == "sim3" else ""
         name = {"origin": "first pose"}.get(found.ape.alignment, found.ape.alignment)
         typer.echo(f"aligned: {name}{scale}; {found.ape.paired} of {found.ape.reference} true poses have an estimate")
+        if found.ape.remark:
+            print_note(found.ape.remark)
     if found.relations is not None:
         typer.echo(f"relations: {found.relations.used} used, {found.relations.missing} outside the path")
 

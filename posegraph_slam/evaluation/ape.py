@@ -14,11 +14,16 @@ from posegraph_slam.evaluation.statistics import ErrorStatistics, summarise
 from posegraph_slam.geometry import SE2, Trajectory, align_points, inverse_pose, planar_from_spatial
 
 Alignment = Literal["auto", "none", "origin", "first", "se2", "se3", "sim3"]
+UNSURE_TURN_DEG = 1.0
+"""An alignment whose turn is less certain than this makes errors of rotation that are not the estimate's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AbsolutePoseError:
-    """Errors of position (m) and heading or attitude (degrees) at `paired` stamps of `reference` known ones."""
+    """Errors of position (m) and heading or attitude (degrees) at `paired` stamps of `reference` known ones.
+
+    `turn_sigma_deg` is how well the positions tell the alignment's rotation; see `AlignedPaths`.
+    """
 
     translation_m: ErrorStatistics
     rotation_deg: ErrorStatistics
@@ -26,6 +31,17 @@ class AbsolutePoseError:
     paired: int
     reference: int
     scale: float = 1.0
+    turn_sigma_deg: float = 0.0
+
+    @property
+    def remark(self) -> str:
+        """What to know before the errors of rotation are read; empty where they mean what they say."""
+        if self.turn_sigma_deg <= UNSURE_TURN_DEG:
+            return ""
+        return (
+            f"the positions tell the rotation of the alignment to {self.turn_sigma_deg:.1f} deg only (they lie in a "
+            "line, or far off), and APE of rotation means no more; look at RPE, or align the first poses"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
@@ -34,6 +50,7 @@ class AbsolutePoseError:
             "rotation_deg": self.rotation_deg.as_dict(),
             "alignment": self.alignment,
             "scale": self.scale,
+            "turn_sigma_deg": self.turn_sigma_deg,
             "paired": self.paired,
             "reference": self.reference,
         }
@@ -65,6 +82,21 @@ class AlignedPaths:
     def rotation_deg(self) -> FloatArray:
         """Angle (P,) between each rotation and the true one."""
         return rotation_angle_deg(inverse_pose(self.true) @ self.estimate)
+
+    @property
+    def turn_sigma_deg(self) -> float:
+        """Deviation of the alignment's least certain turn, as the distances that it leaves tell it; 0 without one.
+
+        Positions in a line say nothing of a turn about it: the lever arms are those across the longest direction.
+        """
+        if self.alignment in ("none", "origin"):
+            return 0.0
+        count, d = len(self.stamps_s), self.true.shape[-1] - 1
+        centred = self.true[:, :d, d] - self.true[:, :d, d].mean(axis=0)
+        moments = np.linalg.eigvalsh(centred.T @ centred)
+        arms = moments.sum() - (moments[-1] if d == 3 else 0.0)
+        variance = np.sum(self.translation_m**2) / max(count * d - d * (d + 1) // 2, 1)
+        return float(np.rad2deg(np.sqrt(variance / arms))) if arms > 0 else 180.0
 
 
 def align_paths(
@@ -115,6 +147,7 @@ def error_of(paths: AlignedPaths, reference: int) -> AbsolutePoseError:
         rotation_deg=rotation_deg,
         alignment=paths.alignment,
         scale=paths.scale,
+        turn_sigma_deg=paths.turn_sigma_deg,
         paired=len(paths.stamps_s),
         reference=reference,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from posegraph_slam.arrays import FloatArray, IntArray
 from posegraph_slam.errors import InputError
 from posegraph_slam.evaluation.ape import absolute_pose_error
-from posegraph_slam.evaluation.summary import compare, evaluate_trajectory
+from posegraph_slam.evaluation.summary import TrajectoryMetrics, compare, evaluate_trajectory
 from posegraph_slam.evaluation.tables import ComparisonRow, ComparisonTable
 from posegraph_slam.execution import Executor, Progress, SerialExecutor, silent_progress
 from posegraph_slam.geometry import SE3, Trajectory, deform
@@ -97,10 +97,15 @@ def optimize_rgbd(
     with clock.stage("evaluation"):
         samples, cells = _samples(stages, tracked.keyframes, parts, views, settings.cloud.max_depth_m)
         gaps = _first_to_last(stages, tracked.keyframes, views, configuration)
-        table, metrics = _compared(stages, log.truth, cells, gaps)
+        measured = {name: evaluate_trajectory(t, truth=log.truth) for name, t in stages.items()}
+        table, metrics = _compared(stages, log.truth, measured, cells, gaps)
         upward = upward_direction(cells["optimised"], -stages["optimised"].poses[:, :3, 1].mean(axis=0))
     notes = (*_without_replaced(log.remarks, bool(remarks)), *remarks)
-    warnings = (*tracked.remarks, *parts.remarks(int(tracked.guessed.sum())), *_warnings(closed, cloud, settings.cloud))
+    warnings = (
+        *tracked.remarks,
+        *parts.remarks(int(tracked.guessed.sum())),
+        *_warnings(closed, cloud, settings.cloud, measured),
+    )
     return RgbdResult(
         stages=stages,
         odometry=tracked,
@@ -190,18 +195,21 @@ def _first_to_last(
 def _compared(
     stages: Mapping[str, Trajectory],
     truth: Trajectory | None,
+    measured: Mapping[str, TrajectoryMetrics],
     cells: Mapping[str, SurfaceCells],
     gaps: Mapping[str, FloatArray] | None,
 ) -> tuple[ComparisonTable, dict[str, Any]]:
     """The table of the stages, and their metrics: errors where the truth is known, and what the images say alone."""
-    measured = {name: evaluate_trajectory(t, truth=truth) for name, t in stages.items()}
     rows, more = list[ComparisonRow](), dict[str, dict[str, float | None]]()
 
-    def add(name: str, unit: str, decimals: int, values: list[float]) -> None:
+    def add(name: str, unit: str, decimals: int, values: Sequence[float | None]) -> None:
         rows.append(ComparisonRow(name=name, unit=unit, decimals=decimals, values=tuple(values)))
         more[name] = dict(zip(stages, values, strict=True))
 
     if truth is not None:
+        steps = [m.rpe.per_frame for m in measured.values() if m.rpe is not None]
+        add("RPE position a frame max", "m", 4, [e.translation_m.max if e.translation_m else None for e in steps])
+        add("RPE rotation a frame max", "deg", 3, [e.rotation_deg.max if e.rotation_deg else None for e in steps])
         from_start = [absolute_pose_error(t, truth, alignment="origin") for t in stages.values()]
         add("position from the first frame max", "m", 4, [e.translation_m.max for e in from_start])
         add("rotation from the first frame max", "deg", 3, [e.rotation_deg.max for e in from_start])
@@ -238,9 +246,15 @@ def _without_replaced(remarks: tuple[str, ...], camera_given: bool) -> tuple[str
     return tuple(remark for remark in remarks if not (camera_given and "intrinsics" in remark))
 
 
-def _warnings(closed: LoopClosureResult, cloud: ColourCloud | None, settings: ColourCloudSettings) -> tuple[str, ...]:
+def _warnings(
+    closed: LoopClosureResult, cloud: ColourCloud | None, settings: ColourCloudSettings,
+    measured: Mapping[str, TrajectoryMetrics],
+) -> tuple[str, ...]:  # fmt: skip
     """Plain sentences on what a user should look at."""
     remarks = closed.warnings()
+    ape = measured["optimised"].ape
+    if ape is not None and ape.remark:
+        remarks.append(ape.remark)
     if cloud is not None and cloud.voxel_m > settings.voxel_m:
         remarks.append(
             f"the cloud's voxels were widened to {cloud.voxel_m:g} m to bound memory (rgbd.cloud.voxels_max)"

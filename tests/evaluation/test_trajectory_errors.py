@@ -68,6 +68,39 @@ def test_absolute_error_is_that_of_evo(seed: int, alignment: Alignment, dimensio
         assert_same(statistics, theirs)
 
 
+@pytest.mark.parametrize(("dimension", "across_m"), [(2, 0.0), (2, 1.0), (3, 0.2), (3, 1.0)])
+def test_the_certainty_of_the_alignment_is_what_noise_of_positions_makes_of_it(dimension: int, across_m: float) -> None:
+    """Rotations are exact and positions noisy, so that what rotation errors there are come from the alignment."""
+    rng = np.random.default_rng(4)
+    group = SE2 if dimension == 2 else SE3
+    poses = np.tile(group.identity(), (30, 1, 1))
+    poses[:, 0, -1] = np.linspace(0, 5, 30)
+    poses[:, 1, -1] = across_m * np.sin(np.arange(30))
+    true = Trajectory(stamps_s=np.arange(30.0), poses=poses, parent="ref", child="base")
+    told, made = [], []
+    for _ in range(200):
+        noisy = poses.copy()
+        noisy[:, :-1, -1] += rng.normal(0, 0.01, (30, dimension))
+        error = absolute_pose_error(true.with_poses(noisy), true)
+        told.append(error.turn_sigma_deg)
+        made.append(error.rotation_deg.mean)
+    # in space two more turns, of much longer arms, add a little to that about the line
+    assert np.mean(told) == pytest.approx(np.sqrt(np.mean(np.square(made))), rel=0.15)
+
+
+def test_errors_of_rotation_are_remarked_on_where_positions_lie_in_a_line() -> None:
+    _, wide = pair_of_trajectories(0, 3)
+    poses = np.array(wide.poses)
+    poses[:, :3, 3] = np.linspace(0, 5, len(poses))[:, None] * [1, 0, 0] + 0.01 * poses[:, :3, 3]
+    line = wide.with_poses(poses)
+    off = np.random.default_rng(1).normal(0, 0.02, (len(poses), 3))
+    for true, alignment, remarked in ((wide, "se3", False), (line, "se3", True), (line, "first", False)):
+        noisy = np.array(true.poses)
+        noisy[:, :3, 3] += off
+        remark = absolute_pose_error(true.with_poses(noisy), true, alignment=alignment).remark
+        assert ("deg only" in remark) == remarked
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("distance_m", [None, 1.0, 5.0])
 @pytest.mark.parametrize("seed", range(3))

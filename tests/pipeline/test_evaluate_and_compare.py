@@ -94,6 +94,17 @@ def test_evaluate_prints_a_table_and_draws(files: tuple[Path, Path], tmp_path: P
     assert json.loads((tmp_path / "ev" / "evaluation.json").read_text())["ape"]["alignment"] == "sim3"
 
 
+def test_evaluate_says_where_positions_do_not_tell_the_rotation(tmp_path: Path) -> None:
+    rows = np.column_stack([0.1 * np.arange(40), np.linspace(0, 4, 40), np.zeros((40, 5)), np.ones(40)])
+    moved = rows.copy()
+    moved[:, 2:4] += 0.01 * np.random.default_rng(2).standard_normal((40, 2))
+    np.savetxt(tmp_path / "true.tum", rows + 1e-3 * np.sin(np.arange(40))[:, None] * [0, 0, 1, 0, 0, 0, 0, 0])
+    np.savetxt(tmp_path / "estimate.tum", moved)
+    told = psg("evaluate", tmp_path / "estimate.tum", tmp_path / "true.tum", "--align", "se3")
+    assert "the positions tell the rotation of the alignment to" in told.stderr
+    assert psg("evaluate", tmp_path / "estimate.tum", tmp_path / "true.tum", "--align", "first").stderr == ""
+
+
 def test_evaluate_refuses_what_does_not_fit(files: tuple[Path, Path], tmp_path: Path) -> None:
     assert "did you mean 'sim3'" in refused("evaluate", *files, "--align", "sim")
     late = tmp_path / "late.tum"
