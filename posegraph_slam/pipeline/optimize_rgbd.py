@@ -101,11 +101,7 @@ def optimize_rgbd(
         table, metrics = _compared(stages, log.truth, measured, cells, gaps)
         upward = upward_direction(cells["optimised"], -stages["optimised"].poses[:, :3, 1].mean(axis=0))
     notes = (*_without_replaced(log.remarks, bool(remarks)), *remarks)
-    warnings = (
-        *tracked.remarks,
-        *parts.remarks(int(tracked.guessed.sum())),
-        *_warnings(closed, cloud, settings.cloud, measured),
-    )
+    warnings = _warnings(tracked, parts, closed, cloud, settings.cloud, measured["optimised"])
     return RgbdResult(
         stages=stages,
         odometry=tracked,
@@ -247,14 +243,13 @@ def _without_replaced(remarks: tuple[str, ...], camera_given: bool) -> tuple[str
 
 
 def _warnings(
-    closed: LoopClosureResult, cloud: ColourCloud | None, settings: ColourCloudSettings,
-    measured: Mapping[str, TrajectoryMetrics],
+    tracked: RgbdOdometry, parts: FrameParts, closed: LoopClosureResult, cloud: ColourCloud | None,
+    settings: ColourCloudSettings, measured: TrajectoryMetrics,
 ) -> tuple[str, ...]:  # fmt: skip
     """Plain sentences on what a user should look at."""
-    remarks = closed.warnings()
-    ape = measured["optimised"].ape
-    if ape is not None and ape.remark:
-        remarks.append(ape.remark)
+    remarks = [*tracked.remarks, *parts.remarks(int(tracked.guessed.sum())), *closed.warnings()]
+    if measured.ape is not None and measured.ape.remark:
+        remarks.append(measured.ape.remark)
     if cloud is not None and cloud.voxel_m > settings.voxel_m:
         remarks.append(
             f"the cloud's voxels were widened to {cloud.voxel_m:g} m to bound memory (rgbd.cloud.voxels_max)"
